@@ -36,7 +36,7 @@ class Physics(Generic[Number, Vector]):
         pressure_diffusion: ν of EDAC [m²/s]: what smooths a carried pressure.
         transport: Background pressure [Pa] of the transport velocity, which keeps particles evenly spread.
         shifting: Strength of particle shifting.
-        tension: Strength of cohesion [m³/s²/kg · kg], see `experiments.sph.surface`.
+        tension: Strength of cohesion [m³/s²/kg · kg], see `jfrnn.sph.surface`.
         surface_tension: σ [N/m] of a free surface, as a continuum force.
         corrected: Gradients of the kernel are renormalized, so that linear fields have exact gradients.
         gravity: Acceleration [m/s²], one number per axis.

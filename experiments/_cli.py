@@ -53,12 +53,11 @@ class Bench(_commands.Commands):
 
 
 class Sph(_commands.Commands):
-    """The fluid solver."""
+    """What measures and validates the fluid solver; `python -m jfrnn.sph` runs it."""
 
     there = {  # noqa: RUF012
         name: ("experiments.sph.commands", name, text)
         for name, text in {
-            "run": "Run a fluid scene, or go on with it.",
             "validate": "Run fluid scenes with known answers.",
             "speed": "Time steps of a fluid scene.",
             "gradients": "Solve inverse problems by gradients.",
@@ -131,15 +130,12 @@ def merge(
         typer.echo(f"{came} rows came; all are in {out / 'rows.jsonl'}")
 
 
-@app.command(name="list", short_help="Say what there is, and what a scene can be told.")
-def list_names(
-    scene: Annotated[str | None, typer.Argument(help="Fluid scene whose settings are asked for; all names without.")] = None,
-) -> None:
-    """Print the names of fluid scenes, layouts, methods and configs; or the settings of a fluid scene, with units and ranges."""
-    with usage_errors():
-        from experiments import _list
+@app.command(name="list", short_help="Say what layouts, methods and configs there are.")
+def list_names() -> None:
+    """Print the names of layouts, methods and configs; `python -m jfrnn.sph list` prints those of fluid scenes."""
+    from experiments import _list
 
-        typer.echo(_list.names() if scene is None else _list.scene(scene))
+    typer.echo(_list.names())
 
 
 @app.command(short_help="Draw a layout.")
@@ -203,4 +199,4 @@ def gpu(
 
 
 _SPH = typer.Typer(cls=Sph, no_args_is_help=True, rich_markup_mode=None)
-app.add_typer(_SPH, name="sph", short_help="Run fluids, validate, time and differentiate them.")
+app.add_typer(_SPH, name="sph", short_help="Validate, time and differentiate the fluid solver.")

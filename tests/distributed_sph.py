@@ -11,9 +11,9 @@ CHECKS.clear()
 import jax  # noqa: E402
 import numpy as np  # noqa: E402
 
-from experiments.sph import solver, spread  # noqa: E402
-from experiments.sph.model import make_model, make_state  # noqa: E402
-from experiments.sph.settings import make_scene  # noqa: E402
+from jfrnn.sph import solver, spread  # noqa: E402
+from jfrnn.sph.model import make_model, make_state  # noqa: E402
+from jfrnn.sph.settings import make_scene  # noqa: E402
 
 
 def begun(name, *settings):

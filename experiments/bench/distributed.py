@@ -189,9 +189,9 @@ def _search(spec: Spec, row: DeviceRow) -> None:
 
 
 def _sph(spec: Spec, row: DeviceRow) -> None:
-    from experiments.sph import spread
-    from experiments.sph.model import make_model, make_state
     from jfrnn.cases import fluids
+    from jfrnn.sph import spread
+    from jfrnn.sph.model import make_model, make_state
 
     depth = 0.5 * (spec.devices if spec.scaling == "weak" else 1)
     scene = fluids.fluid("dam-break-3d", nx=spec.nx, depth=depth)

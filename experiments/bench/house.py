@@ -11,7 +11,8 @@ import typer
 from experiments._commands import take_folder
 from experiments.bench import table
 
-FOLDERS = {"library": ("jfrnn", "kernels"), "experiments": ("experiments",)}
+FOLDERS = {"library": ("jfrnn", "kernels"), "experiments": ("experiments", "jfrnn/sph")}
+ON_TOP = "jfrnn/sph/"  # uses the library and is none of it; once it stood among the experiments
 SOURCES = (".py", ".h", ".cuh")
 COLUMNS = (
     *("commit", "part", "files", "lines", "lines_native", "longest_file", "longest_file_lines", "longest_function"),
@@ -33,7 +34,7 @@ def command(
 
 def count_part(commit: str, part: str) -> dict[str, str | int]:
     """Return the row of a part of the sources at a commit."""
-    texts = dict(_sources(commit, FOLDERS[part]))
+    texts = {path: text for path, text in _sources(commit, FOLDERS[part]) if part != "library" or not path.startswith(ON_TOP)}
     lines = {path: text.count("\n") for path, text in texts.items()}
     trees = {path: ast.parse(text) for path, text in texts.items() if path.endswith(".py")}
     functions = [

@@ -1,1 +1,1 @@
-"""A weakly compressible SPH solver on jfrnn: a scene says what it has, and exactly that is compiled."""
+"""What measures and validates the fluid solver `jfrnn.sph`."""

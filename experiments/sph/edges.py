@@ -14,7 +14,7 @@ import numpy as np
 from jax import Array
 
 import jfrnn
-from experiments.sph.particles import Model, State
+from jfrnn.sph.particles import Model, State
 
 _SLACK = 1.25  # room for more edges, as jax-sph has it
 

@@ -12,10 +12,10 @@ from matplotlib.figure import Figure
 
 from experiments._commands import check_names
 from experiments._look import OURS, PEER, WIDTH, clear, dress, factor, head, make_axes, plain, write_names
-from experiments.sph import solver
 from experiments.sph.inverse import PROBLEMS, Found, Problem, solve
-from experiments.sph.model import Model, State, make_model, make_state
 from jfrnn.cases import fluids
+from jfrnn.sph import solver
+from jfrnn.sph.model import Model, State, make_model, make_state
 
 NAMES = (*PROBLEMS, "memory")
 

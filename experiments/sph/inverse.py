@@ -11,10 +11,11 @@ from jax import Array
 from scipy.optimize import minimize
 
 from experiments._library import LAYERS, free, lattice
-from experiments.sph import answers, solver
-from experiments.sph.model import Model, State, make_model, make_state
+from experiments.sph import answers
 from jfrnn.cases import fluids
 from jfrnn.cases.fluids import FluidScene
+from jfrnn.sph import solver
+from jfrnn.sph.model import Model, State, make_model, make_state
 
 
 @dataclass(frozen=True)

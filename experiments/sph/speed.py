@@ -18,12 +18,13 @@ from experiments import _machine, _measure, _sweep
 from experiments._config import Dtype, Keyed, Positive, Table
 from experiments._loop import Task, fill
 from experiments._rows import RowFile, TimedRow
-from experiments.sph import edges, solver
+from experiments.sph import edges
 from experiments.sph import tradeoff as known_flow
-from experiments.sph.model import Model, State, make_model, make_state
 from experiments.sph.stages import part_times
 from jfrnn.cases import fluids
 from jfrnn.cases.fluids import FluidScene
+from jfrnn.sph import solver
+from jfrnn.sph.model import Model, State, make_model, make_state
 
 Prepare = Callable[[Model, State, float], Any]
 WAYS: dict[str, Prepare] = {

@@ -9,8 +9,9 @@ import numpy as np
 
 import jfrnn
 from experiments import _measure
-from experiments.sph import forces, solver
-from experiments.sph.model import Model, State
+from jfrnn.sph import forces, solver
+from jfrnn.sph.model import Model, State
+from jfrnn.sph.pairs import Neighbors
 
 STAGES = ("search", "density", "walls", "forces", "integration")
 _SUMS = ("density", "walls", "forces")
@@ -60,7 +61,7 @@ def part_times(model: Model, s: State, way: str, skin: float, steps: int, rounds
     return {name: parts[name] for name in STAGES}, others
 
 
-def _sums(model: Model, s: State, nbrs: forces.Neighbors) -> dict[str, Callable[[], Any]]:
+def _sums(model: Model, s: State, nbrs: Neighbors) -> dict[str, Callable[[], Any]]:
     """Return a call for each stage that sums over pairs."""
     rates = jax.jit(lambda model, s, nbrs: forces.carried_rate(model, s, s.rho, None, nbrs))
     fields = jax.jit(lambda model, s, nbrs: forces.fields(model, s, s.rho, None, nbrs))

@@ -55,8 +55,8 @@ def measure(spec: Spec) -> dict[str, Any]:
 
     jax.config.update("jax_enable_x64", spec.dtype == "float64")
     from experiments._measure import Bystanders
-    from experiments.sph import solver
-    from experiments.sph.model import make_model, make_state
+    from jfrnn.sph import solver
+    from jfrnn.sph.model import make_model, make_state
 
     scene, dtype = fluids.fluid(spec.scene, nx=spec.nx), np.dtype(spec.dtype).type
     assert scene.step is not None, "errors are those after whole steps"

@@ -17,10 +17,10 @@ from experiments._commands import check_names
 from experiments._look import MARKERS, OURS, PEER, make_axes, write_names
 from experiments._loop import Task, fill
 from experiments._rows import Row, RowFile
-from experiments.sph import health, solver
-from experiments.sph.model import make_model, make_state
-from experiments.sph.settings import SCENES
 from experiments.sph.validation import CASES, Case, Curves, Seen, look
+from jfrnn.sph import health, solver
+from jfrnn.sph.model import make_model, make_state
+from jfrnn.sph.settings import SCENES
 
 
 @dataclass(kw_only=True)
@@ -54,7 +54,7 @@ def measure(name: str, case: Case, say: Any = print) -> CaseRow:  # noqa: ANN401
     reason = None
     for time in case.times:
         if scene.step is None:
-            s, steps = solver.advance_until(model, s, time)
+            s, _, steps = solver.advance_until(model, s, None, time)
         else:
             steps = round(time / scene.step) - step
             s, _ = solver.advance(model, s, None, steps)

@@ -11,9 +11,10 @@ import numpy as np
 from jax import Array
 
 from experiments._library import taylor_green_velocity
-from experiments.sph import answers, budget, potential, solver
-from experiments.sph.particles import Flow, State
+from experiments.sph import answers, potential
 from jfrnn.cases.fluids import FluidScene, GasScene, Scene
+from jfrnn.sph import solver
+from jfrnn.sph.particles import Flow, State
 
 Curves = dict[str, list[list[float]]]
 
@@ -72,7 +73,7 @@ class Case:
 
 @jax.jit
 def _measures(model: Flow, s: State) -> tuple[Array, Array, dict[str, Array]]:
-    return *solver.density_and_pressure(model, s), budget.energies(model, s)
+    return *solver.density_and_pressure(model, s), solver.energies(model, s)
 
 
 def look(scene: Scene, model: Flow, s: State) -> Seen:

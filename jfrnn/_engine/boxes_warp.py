@@ -270,7 +270,7 @@ def _cpu_sum_callable(variant: SumVariant, term: TermText) -> Call:
     scalar, words = np.float64 if variant.double else np.float32, dict.fromkeys(("info", "scratch", "grids"), np.int32)
     given = ("positions", "queries", "cutoff", *_VALUES, "others", *EXCLUDED * bool(variant.excluding))
     plan = functools.partial(_plan_sums_on_cpu, variant, term)
-    results = dict.fromkeys((*_SUMS, "columns"), scalar) | words
+    results = {**dict.fromkeys((*_SUMS, "columns"), scalar), **words}
     return Call(variant.name("box_sums_cpu"), (*given, *names_of_particles(variant.rule)), results, plan)
 
 

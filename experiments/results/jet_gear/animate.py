@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from experiments.sph import settings, view
 from jfrnn.cases.fluids import Scene
+from jfrnn.sph import settings, view
 
 HIGH, SHOWN, TOP_SPEED, COLORS, MILLISECONDS = 600, 0.84, 16.0, 56, 60
 SLOW, FAST = np.array([0.20, 0.07, 0.02]), np.array([1.0, 0.68, 0.10])  # oil

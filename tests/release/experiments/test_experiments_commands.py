@@ -1,7 +1,5 @@
 """The command line: its list, its help texts, and what it says of values that are out of range."""
 
-import inspect
-import re
 import subprocess
 import sys
 from pathlib import Path
@@ -15,7 +13,6 @@ from experiments import _commands, _config
 from experiments._cli import app
 from experiments._errors import UsageError
 from experiments.gpu.config import Config
-from experiments.sph import ranges, settings, snapshots
 
 ROOT = Path(_commands.__file__).resolve().parent.parent
 CONFIGS = ROOT / "experiments" / "configs"
@@ -24,7 +21,7 @@ BENCH = (
     *("crossover", "crystals", "distributed", "domain", "house", "arrays", "latency", "lj", "options", "peers", "skin", "start"),
     *("structures", "sums", "ties", "triangles", "use"),
 )
-SPH = ("run", "validate", "speed", "gradients")
+SPH = ("validate", "speed", "gradients")
 COMMANDS = (*TOP[:8], *(f"bench {name}" for name in BENCH), *(f"sph {name}" for name in SPH))
 
 
@@ -68,112 +65,13 @@ def test_help_keeps_what_stands_in_brackets(command):
     assert [unit for unit in units.get(command, []) if unit not in text] == []
 
 
-def test_list_says_what_scenes_there_are_and_what_each_can_be_told():
+def test_list_says_what_there_is():
     names = told("list")
-    assert [name for name in settings.SCENES if f"\n  {name} " not in names] == []
     assert all(word in names for word in ("clustersN", "scipy-kdtree", "thesis"))
     assert max(map(len, names.splitlines())) <= 80
-    text = told("list", "dam-break-3d")
-    assert max(map(len, text.splitlines()[1:])) <= 80
-    assert "  nx=20\n      Particles along it. (from 1 to 10 000)\n" in text
-    assert "  gravity=[0.0, 0.0, -9.81]\n      Acceleration [m/s²], one number per axis. (finite)\n" in text
-    assert refused("list", "sea").startswith("list sea: no such scene; there are one, two, ")
-
-
-def test_every_number_that_can_be_set_has_a_range_and_defaults_are_within():
-    for name, scene in settings.SCENES.items():
-        make = inspect.signature(scene).parameters
-        physics = scene().physics
-        kinds = settings.physics_of(name) | settings.parameters(name)
-        for key, kind in kinds.items():
-            default = make[key].default if key in make else getattr(physics, key)
-            bounds = ranges.of(name, key)
-            assert (bounds is not None) == bool(re.search(r"\b(int|float)\b", str(kind))), key
-            assert ranges.read(kind, default, bounds) == default, (name, key)
 
 
 # --- values out of range ----------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("scene", "setting", "message"),
-    [
-        ("dam-break-2d", "nx=-4", "--set nx: got '-4'; input should be greater than or equal to 1 (from 1 to 10 000)"),
-        ("dam-break-2d", "nx=0", "--set nx: got '0'; input should be greater than or equal to 1 (from 1 to 10 000)"),
-        ("dam-break-2d", "nx=2.5", "--set nx: got '2.5'; input should be a valid integer, "),
-        ("taylor-green", "nx=-2", "--set nx: got '-2'; input should be greater than or equal to 1 (from 1 to 10 000)"),
-        ("taylor-green", "dim=4", "--set dim: got '4'; input should be less than or equal to 3 (from 2 to 3)"),
-        ("dam", "smoothing=0", "--set smoothing: got '0'; input should be greater than 0 (above 0)"),
-        ("dam", "smoothing=-1", "--set smoothing: got '-1'; input should be greater than 0 (above 0)"),
-        ("dam", "exponent=0", "--set exponent: got '0'; input should be greater than 0 (above 0)"),
-        ("dam", "duration=NaN", "--set duration: got 'NaN'; input should be a finite number (above 0)"),
-        ("dam", "duration=-1", "--set duration: got '-1'; input should be greater than 0 (above 0)"),
-        ("dam", "duration=0", "--set duration: got '0'; input should be greater than 0 (above 0)"),
-        ("dam", "duration=1e999", "--set duration: got '1e999'; input should be a finite number (above 0)"),
-        ("dam", "step=0", "--set step: got '0'; input should be greater than 0 (above 0)"),
-        ("dam", "density=-1000", "--set density: got '-1000'; input should be greater than 0 (above 0)"),
-        ("dam", "sound_speed=0", "--set sound_speed: got '0'; input should be greater than 0 (above 0)"),
-        ("dam", "spacing=1e-5", "--set spacing: got '1e-5'; input should be greater than or equal to 0.002 (from 0.002 to 1)"),
-        ("dam", "gravity=[0,NaN]", "--set gravity: got '[0,NaN]'; input should be a finite number (finite)"),
-        ("droplet", "radius=-1", "--set radius: got '-1'; input should be greater than 0 (above 0)"),
-        ("poiseuille", "viscosity=-1", "--set viscosity: got '-1'; input should be greater than 0 (above 0)"),
-        ("hydrostatic", "viscosity=-1", "--set viscosity: got '-1'; input should be greater than or equal to 0 (from 0)"),
-        ("dam", "gravity=[0,0,-9.81]", "scene 'dam' --set gravity=[0,0,-9.81]: gravity has 3 components, expected 2 in 2D"),
-        ("dam", "gravity=[]", "scene 'dam' --set gravity=[]: gravity has 0 components, expected 2 in 2D"),
-        (
-            "dam",
-            "smoothing=1e-9",
-            "scene 'dam' --set smoothing=1e-9: smoothing is 1e-09 m, expected 0.1 to 50 particle spacings of ",
-        ),
-        ("dam", "step=1e-300", "scene 'dam' --set step=1e-300: takes steps of 1e-300 s for 2 s, expected up to 1e+09 steps"),
-        ("droplet", "radius=1e-3", "scene 'droplet' --set radius=1e-3: has no particle of fluid: "),
-        ("jet", "duration=1e-9", "scene 'jet' --set duration=1e-9: has no particle of fluid: "),
-        ("jet", "duration=1e300", "scene 'jet' --set duration=1e300: cannot be made ("),
-        ("jet-gear", "teeth=4", "--set teeth: got '4'; input should be greater than or equal to 5 (from 5 to 1 000)"),
-        ("one", "restitution=none", "scene 'one': restitution must be a number from 0 to 1 in a tank, got None"),
-        ("taylor-green", "nx=4", "scene 'taylor-green': periodic box must be 2.05 cutoffs wide along x"),
-    ],
-)
-def test_a_setting_of_a_fluid_that_is_out_of_range(tmp_path, scene, setting, message):
-    assert refused("sph", "run", scene, "--set", setting, "--out", tmp_path / "out").startswith(message)
-    assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize("name", settings.SCENES)
-def test_no_number_of_a_scene_ends_in_anything_but_a_sentence(name):
-    for key, kind in (settings.physics_of(name) | settings.parameters(name)).items():
-        for text in ("-1", "0", "NaN", "1e-300", "[]", "x", ""):
-            if ranges.of(name, key) is not None and (key, text) != ("spacing", "x"):
-                try:
-                    settings.make_scene(name, [f"{key}={text}"])
-                except UsageError as error:
-                    assert f"{key}" in str(error), (key, text, kind)
-
-
-@pytest.mark.parametrize(
-    ("name", "content", "message"),
-    [
-        ("none.npz", None, "--initial {}: cannot be read (No such file or directory); expected a file .npz or .csv"),
-        ("none.csv", None, "--initial {}: cannot be read ("),
-        ("text.npz", b"no archive", "{}: cannot be read: "),
-        ("cut.npz", b"PK\x03\x04 cut", "{}: cannot be read: "),
-        ("empty.npz", b"", "{}: cannot be read: "),
-        ("words.csv", b"x,y\n1,a\n", "{}: positions must be finite; particle 0 is not"),
-        ("masses.csv", b"x,y,m\n1,1,0\n", "{}: expected at least one particle, and masses above 0"),
-    ],
-)
-def test_particles_that_cannot_be_used(tmp_path, name, content, message):
-    path = tmp_path / name
-    if content is not None:
-        path.write_bytes(content)
-    assert refused("sph", "run", "dam", "--initial", path, "--out", tmp_path / "out").startswith(message.format(path))
-    assert not (tmp_path / "out").exists()
-
-
-def test_arrays_of_words_are_no_particles(tmp_path):
-    path = tmp_path / "words.npz"
-    np.savez(path, positions=np.array([["a", "b"]]))
-    assert refused("sph", "run", "dam", "--initial", path).startswith(f"{path}: holds what are no numbers: ")
 
 
 @pytest.mark.parametrize(
@@ -206,16 +104,6 @@ def test_arrays_of_words_are_no_particles(tmp_path):
         (("show", "corners", "--fill", "nan"), "--fill nan: "),
         (("show", "corners", "--seed", "-1"), "--seed -1: "),
         (("show", "corners", "--spacing", "1e-3", "--out", "p.abc"), "--out p.abc: unknown ending '.abc'; allowed: "),
-        (("sph", "run", "dam", "--skin", "nan"), "--skin nan: "),
-        (("sph", "run", "dam", "--frames", "0"), "--frames 0: "),
-        (("sph", "run", "jet", "--solid", "part.stl", "--solid-unit", "-1"), "--solid-unit -1: "),
-        (("sph", "run", "jet", "--solid", "part.stl", "--solid-unit", "nan"), "--solid-unit nan: "),
-        (("sph", "run", "jet", "--solid", "part.stl"), "--solid part.stl is no file: name an STL, OBJ or PLY."),
-        (
-            ("sph", "run", "jet", "--solid-unit", "0.001"),
-            "--solid-unit 0.001: is the unit of the file of --solid; name that file too",
-        ),
-        (("sph", "run", "dam", "--neighbors", "tree"), "--neighbors tree: allowed: auto, pair_sum, list"),
         (("sph", "validate", "sea"), "no case 'sea'; allowed: "),
         (("sph", "gradients", "sea"), "no problem 'sea'; allowed: "),
         (("sph", "gradients", "--evaluations", "0"), "--evaluations 0: "),
@@ -292,7 +180,6 @@ def test_steps_are_timed_of_scenes_that_have_an_nx(tmp_path):
         ("bench", "distributed", CONFIGS / "distributed_smoke.toml"),
         ("gpu", CONFIGS / "h200.toml"),
         ("sph", "speed", CONFIGS / "sph_speed.toml"),
-        ("sph", "run", "one"),
         ("sph", "validate", "one"),
         ("sph", "gradients", "memory"),
         *(("bench", name) for name in ("options", "ties", "crossover", "triangles", "skin", "use", "domain", "latency", "start")),
@@ -326,15 +213,6 @@ def test_folders_that_hold_something_else(tmp_path):
         rows.write_bytes(text)
         assert refused("report", tmp_path).startswith(f"{rows}: line 1 is no row")
     assert refused("merge", tmp_path, tmp_path / "none").startswith(f"{rows}: line 1 is no row")
-    (tmp_path / "run.json").write_text("[1]")
-    assert refused("sph", "run", "one", "--out", tmp_path).startswith(f"{tmp_path / 'run.json'}: says no run (")
-
-
-def test_a_snapshot_that_is_cut_off_is_named(tmp_path):
-    scene = settings.make_scene("one", [])
-    (tmp_path / "000000010.npz").write_bytes(b"PK\x03\x04")
-    with pytest.raises(UsageError, match=r"000000010\.npz: is no snapshot .*; remove it, and the run goes on from the one before"):
-        snapshots.latest(tmp_path, scene)
 
 
 def test_too_little_memory_is_said_in_a_line(capsys):

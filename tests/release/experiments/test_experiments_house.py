@@ -17,6 +17,7 @@ def checkout(tmp_path, monkeypatch):
         "jfrnn/__init__.py": "from jfrnn._above import up\n",
         "jfrnn/_above/__init__.py": 'from jfrnn._below import down\n\n\ndef up(a, b, *, c):\n    """Go."""\n    return down\n',
         "jfrnn/_below/__init__.py": "down = 1  # noqa: X\n",
+        "jfrnn/sph/__init__.py": "above = 1\n",
         "kernels/native/text.h": "a\nb\nc\n",
     }
     for name, text in texts.items():

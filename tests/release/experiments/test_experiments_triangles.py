@@ -1,13 +1,8 @@
-"""The comparison with libraries that find nearest triangles runs, and agrees; meshes are read from files."""
+"""The comparison with libraries that find nearest triangles runs, and agrees."""
 
-import numpy as np
 import pandas as pd
-import pytest
 
-from experiments._errors import UsageError
 from experiments.bench import triangles
-from experiments.sph.settings import _read_mesh
-from jfrnn.cases import meshes
 
 
 def test_a_small_comparison(tmp_path):
@@ -20,25 +15,3 @@ def test_a_small_comparison(tmp_path):
     peers = rows[rows["method"].isin(["trimesh", "libigl", "wp.Mesh nearest"])]
     assert not peers[["missing", "extra"]].to_numpy().any()
     assert "us_per_particle" in text
-
-
-@pytest.mark.parametrize("kind", ["stl", "obj", "ply"])
-def test_meshes_are_read(tmp_path, kind):
-    import trimesh
-
-    vertices, faces = meshes.sphere(2.0, 3)
-    path = tmp_path / f"sphere.{kind}"
-    trimesh.Trimesh(vertices, faces, process=False).export(path)
-    points, named = _read_mesh(path)
-    assert (points.shape, named.shape, named.dtype) == (vertices.shape, faces.shape, np.int32)
-    assert np.allclose(
-        np.sort(points[named].reshape(len(faces), -1), axis=0), np.sort(vertices[faces].reshape(len(faces), -1), axis=0), atol=1e-6
-    )
-
-
-def test_what_is_no_mesh_is_refused(tmp_path):
-    with pytest.raises(UsageError, match="is no file"):
-        _read_mesh(tmp_path / "none.stl")
-    (tmp_path / "text.txt").write_text("no mesh")
-    with pytest.raises(UsageError, match=r"is no mesh|holds no triangles"):
-        _read_mesh(tmp_path / "text.txt")

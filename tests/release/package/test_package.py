@@ -27,6 +27,7 @@ nbrs = jfrnn.search(x, 0.1)
 assert nbrs.backend == {engine!r}
 print(len(nbrs.pairs()[0]))
 """
+FLUID = ("-m", "jfrnn.sph", "run", "one", "--set", "duration=0.0002", "--frames", "1")
 
 
 def run(*arguments, cwd, python=sys.executable, **environment):
@@ -58,6 +59,8 @@ def test_wheel_works_elsewhere(wheel, tmp_path):
     )
     said = run("-c", SEARCH.format(folder=str(tmp_path), engine="warp"), cwd=tmp_path, PYTHONPATH=str(tmp_path / "site"))
     assert int(said.split()[-1]) > 0
+    run(*FLUID, "--no-pictures", cwd=tmp_path, PYTHONPATH=str(tmp_path / "site"))
+    assert (tmp_path / "out/sph/one/snapshots/000000002.vtp").exists()
 
 
 def test_wheel_holds_the_library_alone(wheel):
@@ -101,7 +104,7 @@ def test_a_wheel_made_from_the_sdist_holds_the_same(wheel, tmp_path):
 def test_extras_name_what_the_wheel_holds():
     with (ROOT / "pyproject.toml").open("rb") as stream:
         project = tomllib.load(stream)
-    assert set(project["project"]["optional-dependencies"]) == {"warp", "cuda13"}
+    assert set(project["project"]["optional-dependencies"]) == {"warp", "cuda13", "sph"}
     assert {"experiments", "peers", "notebooks", "docs", "test"} <= set(project["dependency-groups"])
     assert f"version: {jfrnn.__version__}\n" in (ROOT / "CITATION.cff").read_text()
     assert f"\n## {jfrnn.__version__}" in (ROOT / "CHANGELOG.md").read_text()
@@ -109,17 +112,20 @@ def test_extras_name_what_the_wheel_holds():
 
 def test_extras_are_there_for_a_resolver(wheel, tmp_path):
     """Offline: pip resolves the extra whose packages are installed here; the other is one that JAX has."""
-    run("-m", "pip", "install", "--dry-run", "--no-index", f"{wheel}[warp]", cwd=tmp_path)
+    run("-m", "pip", "install", "--dry-run", "--no-index", f"{wheel}[warp,sph]", cwd=tmp_path)
     told = metadata(wheel)
-    assert set(told.get_all("Provides-Extra")) == {"warp", "cuda13"}
+    assert set(told.get_all("Provides-Extra")) == {"warp", "cuda13", "sph"}
     needed = next(line for line in told.get_all("Requires-Dist") if 'extra == "cuda13"' in line)
     assert needed.startswith("jax[cuda13]") and "cuda13" in distribution("jax").metadata.get_all("Provides-Extra")
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("extras", "engine"), [("", "jax"), ("[warp]", "warp"), ("[cuda13]", "jax"), ("[warp,cuda13]", "warp")])
-def test_wheel_works_in_a_fresh_environment_with_each_extra(wheel, tmp_path, extras, engine):
+@pytest.mark.parametrize(
+    ("extras", "engine"), [("", "jax"), ("[warp]", "warp"), ("[sph]", "jax"), ("[cuda13]", "jax"), ("[warp,cuda13]", "warp")]
+)
+def test_wheel_works_in_a_fresh_environment_with_each_extra(wheel, tmp_path, extras):
     """Everything is fetched: those of CUDA take gigabytes."""
+    engine = "warp" if "warp" in extras else "jax"
     run("-m", "venv", str(tmp_path / "venv"), cwd=tmp_path)
     python = str(tmp_path / "venv" / "bin" / "python")
     run("-m", "pip", "install", "--quiet", "--no-compile", "--no-cache-dir", f"{wheel}{extras}", cwd=tmp_path, python=python)
@@ -129,6 +135,9 @@ def test_wheel_works_in_a_fresh_environment_with_each_extra(wheel, tmp_path, ext
     assert int(run("-c", search, cwd=tmp_path, python=python, JAX_PLATFORMS="cpu").split()[-1]) > 0
     said = run("-m", "jfrnn", cwd=tmp_path, python=python, JAX_PLATFORMS="cpu")
     assert f"  {engine:9} right" in said
+    if extras == "[sph]":
+        run(*FLUID, cwd=tmp_path, python=python, JAX_PLATFORMS="cpu")
+        assert (tmp_path / "out/sph/one/one.gif").exists()
 
 
 def metadata(wheel):

@@ -6,9 +6,9 @@ import jax
 import numpy as np
 import pytest
 
-from experiments.sph import budget, solver, states
-from experiments.sph.model import make_model, make_state
 from jfrnn.cases import fluids
+from jfrnn.sph import budget, solver, states
+from jfrnn.sph.model import make_model, make_state
 
 DROP = fluids.fluid("drop", nx=6, duration=0.003)
 

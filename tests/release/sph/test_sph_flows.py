@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 import jfrnn
-from experiments.sph import budget, forces, health, solver
-from experiments.sph.model import make_model, make_state
 from jfrnn.cases import fluids
 from jfrnn.cases._fluid_flows import taylor_green_velocity
+from jfrnn.sph import budget, forces, health, solver
+from jfrnn.sph.model import make_model, make_state
 
 
 def begun(scene, backend="auto"):

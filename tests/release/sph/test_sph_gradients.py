@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments.sph import solver
-from experiments.sph.model import make_model, make_state
 from jfrnn.cases import fluids
+from jfrnn.sph import solver
+from jfrnn.sph.model import make_model, make_state
 
 RANDOM = np.random.default_rng(0)
 SITES = np.stack(np.meshgrid(np.arange(6.0), np.arange(6.0)), axis=-1).reshape(-1, 2) / 6

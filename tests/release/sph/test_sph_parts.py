@@ -5,9 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments.sph import correction, density, pressure, states, surface, transport, viscosity, walls
-from experiments.sph.kernels import KERNELS
-from experiments.sph.pairs import Pair, total
+from jfrnn.sph import correction, density, pressure, states, surface, transport, viscosity, walls
+from jfrnn.sph.kernels import KERNELS
+from jfrnn.sph.pairs import Pair, total
 
 SMOOTHING = 0.13
 

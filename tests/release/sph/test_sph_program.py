@@ -6,9 +6,9 @@ import jax
 import numpy as np
 import pytest
 
-from experiments.sph import solver
-from experiments.sph.model import make_model, make_state
 from jfrnn.cases import fluids
+from jfrnn.sph import solver
+from jfrnn.sph.model import make_model, make_state
 
 N = 64
 SITES = np.stack(np.meshgrid(np.arange(8.0), np.arange(8.0)), axis=-1).reshape(-1, 2) / 8

@@ -1,4 +1,4 @@
-"""`python -m experiments sph`: what a run writes, how it goes on after a kill, and what it says when it goes wrong."""
+"""`python -m jfrnn.sph run`: what a run writes, how it goes on after a kill, and what it says when it goes wrong."""
 
 import json
 
@@ -6,23 +6,20 @@ import numpy as np
 import pytest
 import pyvista
 import trimesh
-from typer.testing import CliRunner
+from test_sph_commands import invoke as command
 
-from experiments._cli import app
-from experiments.sph import health, run
-from experiments.sph.model import make_model, make_state
-from experiments.sph.settings import make_scene, with_solid
 from jfrnn._triangles.winding import is_closed
 from jfrnn.cases import fluids, meshes
+from jfrnn.sph import health, runs
+from jfrnn.sph.errors import SceneError
+from jfrnn.sph.model import make_model, make_state
+from jfrnn.sph.settings import _read_mesh, make_scene, with_solid
 
 FEW = ("--frames", 3, "--set", "duration=0.003")
 
 
 def invoke(*arguments):
-    result = CliRunner().invoke(app, ["sph", "run", *(str(argument) for argument in arguments)])
-    if result.exit_code not in (0, 2):
-        raise result.exception
-    return result.exit_code, result.stdout, result.stderr
+    return command("run", *arguments)
 
 
 def load(folder, step):
@@ -87,7 +84,7 @@ def test_a_folder_of_another_run_is_refused(tmp_path):
         (("dam", "--set", "spacing"), "error: --set spacing: expected key=value"),
         (("dam", "--set", "spacing=wide"), "error: --set spacing: got 'wide'; input should be a valid number"),
         (("dam", "--set", "integrator=euler"), "error: --set integrator: got 'euler'; input should be 'leapfrog', "),
-        (("dam", "--dtype", "float16"), "error: --dtype float16: allowed: float32, float64"),
+        (("dam", "--dtype", "float16"), "error: --dtype: got 'float16'; allowed: float32, float64"),
         (("dam", "--initial", "particles.txt"), "error: particles.txt: unknown ending '.txt'; allowed: .csv, .npz"),
     ],
 )
@@ -177,11 +174,31 @@ def test_a_wall_that_is_open_is_refused_before_a_folder_is_made(tmp_path):
     ("platform", "particles", "way"), [("cpu", 1000, "pair_sum"), ("gpu", 107_660, "list"), ("gpu", 1_059_712, "pair_sum")]
 )
 def test_auto_takes_what_was_measured_to_be_faster(platform, particles, way, tmp_path, monkeypatch):
-    assert run.faster_way(platform, particles) == way
+    assert runs.faster_way(platform, particles) == way
     asked = []
-    monkeypatch.setattr(run, "faster_way", lambda *given: asked.append(given) or way)
+    monkeypatch.setattr(runs, "faster_way", lambda *given: asked.append(given) or way)
     made = []
-    monkeypatch.setattr(run.solver, "list_neighbors", lambda *given: made.append(given))
+    monkeypatch.setattr(runs.solver, "list_neighbors", lambda *given: made.append(given))
     invoke("four", "--frames", 1, "--set", "duration=0.001", "--no-pictures", "--out", tmp_path)
     assert asked == [("cpu", 4)]
     assert len(made) == (way == "list")
+
+
+@pytest.mark.parametrize("kind", ["stl", "obj", "ply"])
+def test_meshes_are_read(tmp_path, kind):
+    vertices, faces = meshes.sphere(2.0, 3)
+    path = tmp_path / f"sphere.{kind}"
+    trimesh.Trimesh(vertices, faces, process=False).export(path)
+    points, named = _read_mesh(path)
+    assert (points.shape, named.shape, named.dtype) == (vertices.shape, faces.shape, np.int32)
+    assert np.allclose(
+        np.sort(points[named].reshape(len(faces), -1), axis=0), np.sort(vertices[faces].reshape(len(faces), -1), axis=0), atol=1e-6
+    )
+
+
+def test_what_is_no_mesh_is_refused(tmp_path):
+    with pytest.raises(SceneError, match="is no file"):
+        _read_mesh(tmp_path / "none.stl")
+    (tmp_path / "text.txt").write_text("no mesh")
+    with pytest.raises(SceneError, match=r"is no mesh|holds no triangles"):
+        _read_mesh(tmp_path / "text.txt")

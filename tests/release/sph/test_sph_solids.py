@@ -7,13 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from matplotlib.path import Path as Outline
-from typer.testing import CliRunner
+from test_sph_commands import invoke
 
-from experiments._cli import app
-from experiments.sph import budget, health, solids, solver, view
-from experiments.sph.kernels import KERNELS
-from experiments.sph.model import make_model, make_state
 from jfrnn.cases import fluids, meshes
+from jfrnn.sph import budget, health, solids, solver, view
+from jfrnn.sph.kernels import KERNELS
+from jfrnn.sph.model import make_model, make_state
 
 TURNS = fluids.Turning((0.1, -0.2, 0.3), (1.0, 2.0, -0.5), 3.0)
 
@@ -267,8 +266,7 @@ def test_a_coarse_jet_that_breaks_up_stays_calm():
 def test_a_run_of_the_jet_onto_the_gear(tmp_path):
     options = ["jet-gear", "--set", "layers=3", "--set", "faces=400", "--set", "duration=0.0006", "--set", "height=0.001"]
     options += ["--frames", "2", "--dtype", "float32", "--out", str(tmp_path)]
-    result = CliRunner().invoke(app, ["sph", "run", *options])
-    assert result.exit_code == 0, result.output
+    assert invoke("run", *options)[0] == 0
     table = np.genfromtxt(tmp_path / "energies.csv", delimiter=",", names=True)
     assert len(list((tmp_path / "frames").glob("*.png"))) == 3
     assert table["clearance"].min() > 0
@@ -276,6 +274,6 @@ def test_a_run_of_the_jet_onto_the_gear(tmp_path):
     with np.load(last) as saved:
         before = saved["x"]
     last.unlink()
-    assert CliRunner().invoke(app, ["sph", "run", *options]).exit_code == 0
+    assert invoke("run", *options)[0] == 0
     with np.load(last) as saved:
         np.testing.assert_allclose(saved["x"], before, atol=1e-6)

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 from places import ROOT
 
-from experiments.sph import budget, solver
-from experiments.sph.model import make_model, make_state
 from jfrnn.cases import fluids
+from jfrnn.sph import budget, solver
+from jfrnn.sph.model import make_model, make_state
 
 REFERENCE = ROOT / "experiments" / "reference"
 

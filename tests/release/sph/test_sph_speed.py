@@ -15,9 +15,10 @@ from typer.testing import CliRunner
 from experiments import _config
 from experiments._cli import app
 from experiments._errors import UsageError
-from experiments.sph import edges, forces, speed, speed_report, tradeoff
-from experiments.sph.model import make_model, make_state
+from experiments.sph import edges, speed, speed_report, tradeoff
 from jfrnn.cases import fluids
+from jfrnn.sph import forces
+from jfrnn.sph.model import make_model, make_state
 
 TINY = """
 scene = "dam-break-2d"

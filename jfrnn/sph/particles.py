@@ -1,16 +1,17 @@
 """What a scene is made of once it is in JAX: a model, which stays, and a state, which moves. Both are pytrees."""
 
 from dataclasses import dataclass, field, fields
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import jax
+import jax.numpy as jnp
 from jax import Array
 
 import jfrnn
-from experiments.sph.kernels import KERNELS, Kernel
-from experiments.sph.pairs import reach
 from jfrnn.cases import fluids
 from jfrnn.cases.fluids import Gas, Physics, Turning
+from jfrnn.sph.kernels import KERNELS, Kernel
+from jfrnn.sph.pairs import reach
 
 jax.tree_util.register_dataclass(
     fluids.Physics,
@@ -60,6 +61,11 @@ class Model:
         return KERNELS[self.physics.kernel]
 
     @property
+    def fluid_mass(self) -> Array:
+        """Masses [kg], shape [n], 0 of dummies of walls."""
+        return self.m if self.wall is None else jnp.where(self.wall, 0, self.m)
+
+    @property
     def cutoff(self) -> float:
         """Interaction radius of pairs [m]: that of the kernel and a little more, see `pairs.reach`."""
         return reach(self.kernel, self.physics.smoothing)
@@ -83,11 +89,18 @@ class GasModel:
     step: Array | None
     dim: int = field(metadata={"static": True})
     backend: str = field(default="auto", metadata={"static": True})
+    enters: ClassVar[None] = None  # all are there, and there is no wall
+    turning: ClassVar[None] = None
 
     @property
     def kernel(self) -> Kernel:
         """The smoothing kernel."""
         return KERNELS[self.physics.kernel]
+
+    @property
+    def fluid_mass(self) -> Array:
+        """Masses [kg], shape [n]."""
+        return self.m
 
 
 class Beside(NamedTuple):

@@ -2,7 +2,7 @@
 
 from jax import Array
 
-from experiments.sph.pairs import Pair, Values
+from jfrnn.sph.pairs import Pair, Values
 
 
 def summation(pair: Pair, j: Values) -> Array:

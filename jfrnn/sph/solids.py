@@ -19,11 +19,11 @@ import numpy as np
 from jax import Array
 
 import jfrnn
-from experiments.sph.kernels import KERNELS, Kernel
-from experiments.sph.pairs import reach
-from experiments.sph.particles import Beside, Model, State
 from jfrnn.cases import fluids
-from jfrnn.cases.fluids import FluidScene, Turning
+from jfrnn.cases.fluids import FluidScene, Scene, Turning
+from jfrnn.sph.kernels import KERNELS, Kernel
+from jfrnn.sph.pairs import reach
+from jfrnn.sph.particles import Beside, Model, State
 
 GAP = 0.2  # particle spacings: on a lattice, particles at a wall are half a spacing away
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
@@ -72,7 +72,7 @@ def _reach(scene: FluidScene) -> float:
     return reach(KERNELS[scene.physics.kernel], scene.physics.smoothing)
 
 
-def turning_of(scene: FluidScene, dtype: np.dtype | type) -> Turning[Array, Array] | None:
+def turning_of(scene: Scene, dtype: np.dtype | type) -> Turning[Array, Array] | None:
     """Return how the solid of a scene turns, numbers of a dtype; None where it stands, or is none."""
     turning = scene.solid and scene.solid.turning
     if turning is None:
@@ -247,7 +247,7 @@ def rim_speed(model: Model, beside: Beside) -> Array:
     return jnp.abs(model.turning.rate) * jnp.max(jnp.linalg.norm(corners - model.turning.center, axis=1))
 
 
-def clearance(scene: FluidScene, s: State) -> np.ndarray | None:
+def clearance(scene: Scene, s: State) -> np.ndarray | None:
     """Return the signed distances [m] of the fluid to the solid of its scene, shape [n], infinite where it is beyond reach.
 
     Triangles are searched and distances computed anew, at the positions of the state.

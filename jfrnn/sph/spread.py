@@ -16,10 +16,10 @@ import numpy as np
 from jax import Array
 from jax.sharding import Mesh
 
-from experiments.sph import forces, solver
-from experiments.sph.model import Model, State
 from jfrnn import distributed
 from jfrnn.distributed import Halo, Particles
+from jfrnn.sph import forces, solver
+from jfrnn.sph.particles import Model, State
 
 OF_STATE = ("v", "a", "rho", "p", "w")  # what of a state is known of each particle, besides positions
 _OF_MODEL = ("m", "wall", "enters")

@@ -6,7 +6,7 @@ acceleration: with them momentum is kept to the rounding of the sums.
 
 from jax import Array
 
-from experiments.sph.pairs import Pair, Values
+from jfrnn.sph.pairs import Pair, Values
 
 
 def symmetric(pair: Pair, i: Values, j: Values) -> Array:

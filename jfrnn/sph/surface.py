@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 from jax import Array
 
-from experiments.sph.pairs import Pair, Values
+from jfrnn.sph.pairs import Pair, Values
 
 
 def cohesion(pair: Pair, i: Values, j: Values, strength: Array, reach: float) -> Array:

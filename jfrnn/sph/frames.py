@@ -9,8 +9,8 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from PIL import Image
 
-from experiments.sph import view
 from jfrnn.cases.fluids import Scene
+from jfrnn.sph import view
 
 WALL = "0.75"
 

@@ -6,7 +6,7 @@ Velocities are read from `u`: those of particles, and of wall dummies what holds
 import jax.numpy as jnp
 from jax import Array
 
-from experiments.sph.pairs import Pair, Values
+from jfrnn.sph.pairs import Pair, Values
 
 
 def morris(pair: Pair, i: Values, j: Values, viscosity: Array) -> Array:

@@ -5,7 +5,7 @@ from typing import Any
 import jax.numpy as jnp
 from jax import Array
 
-from experiments.sph.pairs import Pair, Values
+from jfrnn.sph.pairs import Pair, Values
 
 
 def bounce(x: Array, v: Array, lower: Array, upper: Array, restitution: Array) -> tuple[Array, Array]:

@@ -6,14 +6,11 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-import jfrnn
-from experiments.sph import correction, density, solids, states, surface, transport, viscosity, walls
-from experiments.sph.kernels import KERNELS
-from experiments.sph.model import Model, State
-from experiments.sph.pairs import Edges, Pair, Term, Values, total
-from experiments.sph.pressure import PRESSURES
-
-Neighbors = jfrnn.NeighborList | Edges | None
+from jfrnn.sph import correction, density, solids, states, surface, transport, viscosity, walls
+from jfrnn.sph.kernels import KERNELS
+from jfrnn.sph.pairs import Neighbors, Pair, Term, Values, total
+from jfrnn.sph.particles import Flow, Model, State
+from jfrnn.sph.pressure import PRESSURES
 
 
 class Fields(NamedTuple):
@@ -25,7 +22,7 @@ class Fields(NamedTuple):
     inverse: Array | None
 
 
-def active(model: Model, time: Array) -> Array | None:
+def active(model: Flow, time: Array) -> Array | None:
     """Return which particles have entered, shape [n], bool; None where all are there from the beginning."""
     return None if model.enters is None else time >= model.enters
 

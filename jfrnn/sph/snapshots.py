@@ -1,6 +1,8 @@
 """What a run keeps of itself: snapshots as .npz, to go on from, and as .vtp, for ParaView; and a line of energies each."""
 
+import errno
 import json
+import os
 from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile
@@ -8,11 +10,11 @@ from zipfile import BadZipFile
 import jax.numpy as jnp
 import numpy as np
 
-from experiments._commands import take_folder
-from experiments._errors import UsageError
-from experiments.sph import budget, solids
-from experiments.sph.particles import Flow, State, Thermal
-from jfrnn.cases.fluids import FluidScene, Scene
+from jfrnn.cases.fluids import Scene
+from jfrnn.sph import budget, solids, solver
+from jfrnn.sph.errors import SceneError
+from jfrnn.sph.model import kind_of
+from jfrnn.sph.particles import Flow, State, Thermal
 
 
 def save(state: State, scene: Scene, rho: np.ndarray, p: np.ndarray, folder: Path, step: int) -> None:
@@ -39,32 +41,43 @@ def latest(folder: Path, scene: Scene) -> tuple[State, int] | None:
         angle, gas = arrays.pop("angle", None), [arrays.pop(name) for name in Thermal._fields if name in arrays]
         s = State(**arrays, gas=Thermal(*gas) if gas else None)  # pyright: ignore[reportArgumentType]
     except (ValueError, TypeError, EOFError, BadZipFile) as error:
-        raise UsageError(f"{paths[-1]}: is no snapshot ({error}); remove it, and the run goes on from the one before") from error
-    solid = solids.begin(scene, s.x, angle) if isinstance(scene, FluidScene) else None
-    return s._replace(solid=solid), int(paths[-1].stem)
+        raise SceneError(f"{paths[-1]}: is no snapshot ({error}); remove it, and the run goes on from the one before") from error
+    return s._replace(solid=kind_of(scene).beside(scene, s.x, angle)), int(paths[-1].stem)
 
 
 def check_same(about: dict[str, Any], folder: Path) -> None:
     """Remember what the run is, or refuse a folder that holds another one.
 
     Raises:
-        UsageError: The folder holds a run of something else, or cannot be written.
+        SceneError: The folder holds a run of something else, or cannot be written.
     """
-    path, text = take_folder(folder) / "run.json", json.dumps(about, indent=1, sort_keys=True)
+    path, text = _take(folder) / "run.json", json.dumps(about, indent=1, sort_keys=True)
     if not path.exists():
         path.write_text(text)
         return
     try:
         there = dict(json.loads(path.read_text()))
     except (TypeError, ValueError) as error:
-        raise UsageError(f"{path}: says no run ({error}); take another folder, or remove it") from error
+        raise SceneError(f"{path}: says no run ({error}); take another folder, or remove it") from error
     if there != (asked := json.loads(text)):
         different = [key for key in asked if asked[key] != there.get(key)]
-        raise UsageError(f"{folder}: holds a run with another {', '.join(different)}; take another folder, or remove it")
+        raise SceneError(f"{folder}: holds a run with another {', '.join(different)}; take another folder, or remove it")
+
+
+def _take(folder: Path) -> Path:
+    """Make the folder of a run, and return it."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if not os.access(folder, os.W_OK | os.X_OK):
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+    except OSError as error:
+        reason = "there is a file of that name" if isinstance(error, FileExistsError | NotADirectoryError) else error.strerror
+        raise SceneError(f"{folder}: cannot be written ({reason}); name a folder that can be") from error
+    return folder
 
 
 def energies(model: Flow, state: State, scene: Scene) -> dict[str, float]:
-    """Return a line of the energies: time [s], `budget.energies` [J] and their total, momentum [kg m/s], largest speed [m/s].
+    """Return a line of the energies: time [s], `solver.energies` [J] and their total, momentum [kg m/s], largest speed [m/s].
 
     Of a gas, also the largest smoothing length over the smallest. Where there is a solid, also the least signed distance to it [m],
     infinite where nothing is within its reach.
@@ -73,14 +86,14 @@ def energies(model: Flow, state: State, scene: Scene) -> dict[str, float]:
     fluid = np.ones(scene.n, bool) if scene.wall is None else ~scene.wall
     line = {
         "time": float(state.time),
-        **(held := {name: float(value) for name, value in budget.energies(model, state).items()}),
+        **(held := {name: float(value) for name, value in solver.energies(model, state).items()}),
         **{f"momentum_{axis}": float(moved[k]) for k, axis in enumerate("xyz"[: scene.dim])},
         "top_speed": float(np.linalg.norm(np.asarray(state.v)[fluid], axis=1).max(initial=0)),
     }
     line |= {"total": sum(held.values())}
     if state.gas is not None:
         line |= {"resolution": float(state.gas.h.max() / state.gas.h.min())}
-    distances = solids.clearance(scene, state) if isinstance(scene, FluidScene) else None
+    distances = solids.clearance(scene, state)
     return line if distances is None else line | {"clearance": float(distances.min(initial=np.inf))}
 
 

@@ -3,22 +3,13 @@
 import jax.numpy as jnp
 from jax import Array
 
-from experiments.sph import gas, states
-from experiments.sph.model import Model, State
-from experiments.sph.particles import Flow, GasModel
-
-
-def energies(model: Flow, s: State) -> dict[str, Array]:
-    """Return the energies [J; in 2D J/m], shape [] each, by name: kinetic, and potential or, of a gas, thermal, Σ m u."""
-    kinetic = {"kinetic": kinetic_energy(model, s)}
-    if isinstance(model, GasModel):
-        return kinetic | {"thermal": jnp.sum(model.m * gas.thermal(s).u)}
-    return kinetic | {"potential": potential_energy(model, s)}
+from jfrnn.sph import states
+from jfrnn.sph.particles import Flow, Model, State
 
 
 def kinetic_energy(model: Flow, s: State) -> Array:
     """Return ½ Σ m v² of the fluid [J; in 2D J/m], shape []."""
-    return jnp.sum(_masses(model) * jnp.sum(s.v * s.v, axis=1)) / 2
+    return jnp.sum(model.fluid_mass * jnp.sum(s.v * s.v, axis=1)) / 2
 
 
 def potential_energy(model: Model, s: State) -> Array:
@@ -26,7 +17,7 @@ def potential_energy(model: Model, s: State) -> Array:
     if model.physics.gravity is None:
         return jnp.zeros((), s.x.dtype)
     ground = jnp.zeros((), s.x.dtype) if model.tank is None else model.tank[0]
-    return -jnp.sum(_masses(model) * jnp.sum((s.x - ground) * model.physics.gravity, axis=1))
+    return -jnp.sum(model.fluid_mass * jnp.sum((s.x - ground) * model.physics.gravity, axis=1))
 
 
 def internal_energy(model: Model, s: State) -> Array:
@@ -44,13 +35,9 @@ def internal_energy(model: Model, s: State) -> Array:
         each = states.linear_energy(s.rho, physics.density, physics.sound_speed)
     else:
         each = states.tait_energy(s.rho, physics.density, physics.sound_speed, physics.exponent)
-    return jnp.sum(_masses(model) * each)
+    return jnp.sum(model.fluid_mass * each)
 
 
 def momentum(model: Flow, s: State) -> Array:
     """Return Σ m v of the fluid [kg m/s], shape [d]."""
-    return jnp.sum(_masses(model)[:, None] * s.v, axis=0)
-
-
-def _masses(model: Flow) -> Array:
-    return model.m if isinstance(model, GasModel) or model.wall is None else jnp.where(model.wall, 0, model.m)
+    return jnp.sum(model.fluid_mass[:, None] * s.v, axis=0)

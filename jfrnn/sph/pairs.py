@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jax import Array
 
 import jfrnn
-from experiments.sph.kernels import Kernel
+from jfrnn.sph.kernels import Kernel
 
 Values = dict[str, Array]
 """What is known of each particle: m [kg], rho [kg/m³], volume m/rho, specific 1/rho, p [Pa], v, u, w [m/s], wall, inverse."""
@@ -39,6 +39,10 @@ class Edges(Protocol):
     def sum(self, fn: Callable[[Array, Any, Any], Any], positions: Array, values: Any) -> Any:  # noqa: ANN401
         """Sum fn(r, values of i, values of j) over the edges of each i, leaves [n, ...]."""
         ...
+
+
+Neighbors = jfrnn.NeighborList | Edges | None
+"""Where pairs come from: a list, edges, or, of None, a search by each sum."""
 
 
 class Pair:
@@ -86,7 +90,7 @@ def total(
     values: Values,
     kernel: Kernel,
     h: float,
-    nbrs: jfrnn.NeighborList | Edges | None = None,
+    nbrs: Neighbors = None,
     **options: Any,  # noqa: ANN401
 ) -> Any:  # noqa: ANN401
     """Sum a term over the neighbors of each particle.

@@ -9,12 +9,12 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 
-from experiments.sph.pairs import Pair, Values, total_of_own
-from experiments.sph.particles import GasModel, State, Thermal
 from jfrnn.cases.fluids import GasScene
+from jfrnn.sph import budget
+from jfrnn.sph.pairs import Neighbors, Pair, Values, total_of_own
+from jfrnn.sph.particles import GasModel, State, Thermal
 
 COURANT = 0.3
 PASSES = 1  # of Newton's method in each step: the lengths of the step before, grown with the flow, are off by the square of a step
@@ -32,7 +32,7 @@ class Density(NamedTuple):
     omega: Array
 
 
-def make_model(scene: GasScene, dtype: type = np.float64, backend: str = "auto") -> GasModel:
+def make_model(scene: GasScene, dtype: type, backend: str) -> GasModel:
     """Put what acts in a gas into JAX, numbers of one dtype.
 
     Raises:
@@ -49,7 +49,7 @@ def make_model(scene: GasScene, dtype: type = np.float64, backend: str = "auto")
     return GasModel(jax.tree.map(array, scene.physics), array(scene.masses), step, scene.dim, backend)
 
 
-def make_state(scene: GasScene, dtype: type = np.float64) -> State:
+def make_state(scene: GasScene, dtype: type) -> State:
     """Put the particles of a gas into JAX, where they are at first; `begin` finds their smoothing lengths."""
     x, v, u = (jnp.asarray(each, dtype) for each in (scene.positions, scene.velocities, scene.energies))
     zero = jnp.zeros((), dtype)
@@ -57,7 +57,11 @@ def make_state(scene: GasScene, dtype: type = np.float64) -> State:
     return State(x, v, zero, jnp.zeros_like(x), zero, gas=Thermal(u, lengths, jnp.zeros_like(u), jnp.zeros_like(u)))
 
 
-def begin(model: GasModel, s: State) -> State:
+def beside(scene: GasScene, x: Array, angle: Array | None) -> None:
+    """Return None: a gas here has no walls."""
+
+
+def begin(model: GasModel, s: State, nbrs: Neighbors = None) -> State:
     """Return the state with smoothing lengths, accelerations and rates of its positions, velocities and thermal energies."""
     u, first, *_ = thermal(s)
     h = jax.lax.fori_loop(0, FIRST_PASSES, lambda _, h: improve(model, h, sum_density(model, s.x, h)), first)
@@ -80,7 +84,7 @@ def courant(model: GasModel, s: State) -> Array:
     return jnp.min(jnp.minimum(COURANT * h / jnp.maximum(signal, least), 0.25 * jnp.sqrt(h) / square**0.25))
 
 
-def step(model: GasModel, s: State, dt: Array) -> State:
+def step(model: GasModel, s: State, dt: Array, nbrs: Neighbors = None) -> tuple[State, Neighbors]:
     """Kick half, drift, kick half (velocity Verlet), thermal energies as velocities.
 
     Rates at the new positions are those of the velocities and energies that the rates before lead to.
@@ -92,7 +96,7 @@ def step(model: GasModel, s: State, dt: Array) -> State:
         h = improve(model, h, sum_density(model, x, h))
     s = _evaluate(model, s._replace(x=x, v=middle + dt / 2 * s.a), u + dt / 2 * heating, h)
     now = thermal(s)
-    return s._replace(v=middle + dt / 2 * s.a, gas=now._replace(u=u + dt / 2 * now.heating))
+    return s._replace(v=middle + dt / 2 * s.a, gas=now._replace(u=u + dt / 2 * now.heating)), None
 
 
 def thermal(s: State) -> Thermal:
@@ -108,11 +112,20 @@ def sound_speed(model: GasModel, u: Array) -> Array:
     return jnp.where(warm, jnp.sqrt(gamma * (gamma - 1) * jnp.where(warm, u, 1)), 0)
 
 
-def density_and_pressure(model: GasModel, s: State) -> tuple[Array, Array]:
+def density_and_pressure(model: GasModel, s: State, nbrs: Neighbors = None) -> tuple[Array, Array]:
     """Return ρ = m (η/h)^d [kg/m³] and p = (γ-1)ρu [Pa], shape [n] each, of a state that has begun."""
     u, h, *_ = thermal(s)
     rho = model.m * (model.physics.smoothing_ratio / h) ** model.dim
     return rho, (model.physics.heat_ratio - 1) * rho * u
+
+
+def list_neighbors(model: GasModel, s: State, skin: float, slack: float) -> None:
+    """Return None: cutoffs change in every step."""
+
+
+def energies(model: GasModel, s: State) -> dict[str, Array]:
+    """Return kinetic and thermal energy, Σ m u [J; in 2D J/m], shape [] each, by name."""
+    return {"kinetic": budget.kinetic_energy(model, s), "thermal": jnp.sum(model.m * thermal(s).u)}
 
 
 def sum_density(model: GasModel, x: Array, h: Array) -> Density:

@@ -1,22 +1,22 @@
 """Run a scene: in chunks of steps, a snapshot, a line of energies and a picture after each, from the last snapshot on."""
 
 import hashlib
-import math
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
 
 import jax
 import numpy as np
+from jax import Array
 
 import jfrnn
-from experiments import _loop
-from experiments._errors import UsageError
-from experiments.sph import forces, frames, health, settings, snapshots, solids, solver
-from experiments.sph.forces import Neighbors
-from experiments.sph.model import make_model, make_state
-from experiments.sph.particles import Flow, GasModel, Model, State
 from jfrnn.cases.fluids import GasScene, Scene
+from jfrnn.sph import forces, health, settings, snapshots, solids, solver
+from jfrnn.sph.errors import SceneError
+from jfrnn.sph.model import make_model, make_state
+from jfrnn.sph.pairs import Neighbors
+from jfrnn.sph.particles import Flow, State
+from jfrnn.sph.progress import Progress
 
 
 @dataclass(frozen=True)
@@ -38,6 +38,7 @@ class How:
     pictures: bool = True
 
 
+MOST_STEPS = 2000  # between two looks at a run
 MOST_FOR_LISTS = 1 << 18  # particles up to which sums over a list are faster on a GPU; see `faster_way`
 
 
@@ -62,38 +63,41 @@ def run(scene: Scene, folder: Path, how: How) -> State:
         The last state.
 
     Raises:
-        UsageError: The folder holds another run, or the scene cannot be run.
+        SceneError: The folder holds another run, or the scene cannot be run.
         DivergedError: A particle is not finite, or went through a wall.
     """
     about = settings.describe(scene) | {"dtype": how.dtype, "frames": how.frames, "given": _digest(scene)}
+    dtype = np.dtype(how.dtype).type
     try:
-        model = make_model(scene, np.dtype(how.dtype).type)
-        first = None if (folder / "run.json").exists() else make_state(scene, np.dtype(how.dtype).type)  # refused before
-        snapshots.check_same(about, folder)
-        saved = snapshots.latest(folder / "snapshots", scene)
-        s, step = saved or (first or make_state(scene, np.dtype(how.dtype).type), 0)
+        model, first = make_model(scene, dtype), make_state(scene, dtype)  # what is refused leaves no folder
     except ValueError as error:
-        raise UsageError(f"scene {scene.name!r}: {error}") from error
+        raise SceneError(f"scene {scene.name!r}: {error}") from error
+    snapshots.check_same(about, folder)
+    saved = snapshots.latest(folder / "snapshots", scene)
+    s, step = saved or (first, 0)
     nbrs = _first_neighbors(scene, model, s, how)
     if saved is None:
         s = jax.jit(solver.begin)(model, s, nbrs)
         _keep(scene, model, s, nbrs, folder, step, how)
-    with _loop.show(how.frames, round(how.frames * float(s.time) / scene.duration)) as shown:
-        shown.label(scene.name)
-        while (goal := _next_moment(scene, model, s, how.frames)) is not None:
-            start, before, nbrs_before = perf_counter(), s, nbrs
+    progress = Progress(how.frames, round(how.frames * float(s.time) / scene.duration))
+    while (goal := _next_moment(scene, s, how.frames)) is not None:
+        start, before_it = perf_counter(), step
+        while float(s.time) < goal:
+            before, nbrs_before = s, nbrs
             s, nbrs, steps = _chunk(model, s, nbrs, goal)
             jax.block_until_ready(s.x)
-            seconds = perf_counter() - start
             health.check(scene, model, before, nbrs_before, s, steps, step)
             if isinstance(nbrs, jfrnn.NeighborList):
                 nbrs.check()
             step += steps
-            line = _keep(scene, model, s, nbrs, folder, step, how)
-            text = f"t {line['time']:.4g} s · {steps / seconds:.0f} steps/s · energy {line['total']:.4g} J"
-            shown.label(text + ("" if nbrs is None else f" · {int(nbrs.rebuild_count)} rebuilds"))
-            shown.advance()
+        seconds = perf_counter() - start
+        line = _keep(scene, model, s, nbrs, folder, step, how)
+        text = f"{scene.name}: t {line['time']:.4g} s, {(step - before_it) / seconds:.0f} steps/s, energy {line['total']:.4g} J"
+        progress.advance(text + ("" if nbrs is None else f", {int(nbrs.rebuild_count)} rebuilds"))
+    progress.end()
     if how.pictures:
+        from jfrnn.sph import frames
+
         frames.animate(folder / "frames", folder / f"{scene.name}.gif")
     return s
 
@@ -102,14 +106,13 @@ def _first_neighbors(scene: Scene, model: Flow, s: State, how: How) -> Neighbors
     """Return a list where sums over one are asked for or faster; the smoothing lengths of a gas change in every step.
 
     Raises:
-        UsageError: A list is asked for, of a gas.
+        SceneError: A list is asked for, of a gas.
     """
-    if isinstance(model, GasModel):
-        if how.neighbors == "list":
-            raise UsageError(f"--neighbors list: the cutoffs of scene {scene.name!r} change in every step; take pair_sum or auto")
-        return None
     way = faster_way(jax.default_backend(), scene.n) if how.neighbors == "auto" else how.neighbors
-    return solver.list_neighbors(model, s, how.skin * scene.spacing) if way == "list" else None
+    nbrs = solver.list_neighbors(model, s, how.skin * scene.spacing) if way == "list" else None
+    if how.neighbors == "list" and nbrs is None:
+        raise SceneError(f"neighbors 'list': the cutoffs of scene {scene.name!r} change in every step; take pair_sum or auto")
+    return nbrs
 
 
 def _digest(scene: Scene) -> str:
@@ -121,43 +124,35 @@ def _digest(scene: Scene) -> str:
 
 
 def _chunk(model: Flow, s: State, nbrs: Neighbors, goal: float) -> tuple[State, Neighbors, int]:
-    """Run steps to about a time [s], and return their number; where a row of a list overflowed, with a larger list again.
-
-    The steps of a fluid grow slowly: their number is told by the first. Those of a gas grow fast after a blast, and are counted.
-    """
-    if isinstance(model, GasModel):
-        after, taken = solver.advance_until(model, s, goal)
-        return after, None, int(taken)
-    steps = max(1, round((goal - float(s.time)) / _step_now(model, s)))
+    """Run steps to a time [s], at most `MOST_STEPS`, and return their number; where a row of a list overflowed, all again."""
     while True:
-        after, seen = _chunk_of_particles(model, s, nbrs, steps)
+        after, seen, steps = _chunk_of_particles(model, s, nbrs, goal)
         if s.solid is None or after.solid is None or not after.solid.tri.overflow:
-            return after, seen, steps
+            return after, seen, int(steps)
         larger = after.solid.tri.grow(solids.into_frame(s.x, model.turning, s.solid.angle))
         s = s._replace(solid=s.solid._replace(tri=larger))
 
 
-def _chunk_of_particles(model: Model, s: State, nbrs: Neighbors, steps: int) -> tuple[State, Neighbors]:
+def _chunk_of_particles(model: Flow, s: State, nbrs: Neighbors, goal: float) -> tuple[State, Neighbors, Array | int]:
     if nbrs is None:
-        return solver.advance(model, s, None, steps)
-    active = None if model.enters is None else lambda s: forces.active(model, s.time)
+        return solver.advance_until(model, s, None, goal, MOST_STEPS)
+    active = None if model.enters is None else lambda carry: forces.active(model, carry[0].time)
+
+    def advance(carry: tuple[State, Array | int], nbrs: Neighbors) -> tuple[tuple[State, Array | int], Neighbors]:
+        after, nbrs, steps = solver.advance_until(model, carry[0], nbrs, goal, MOST_STEPS)
+        return (after, steps), nbrs
+
     try:
-        return jfrnn.run_chunk(lambda s, nbrs: solver.advance(model, s, nbrs, steps), s, nbrs, lambda s: s.x, active=active)  # type: ignore[arg-type]
+        (after, steps), nbrs = jfrnn.run_chunk(advance, (s, 0), nbrs, lambda carry: carry[0].x, active=active)  # type: ignore[arg-type]
     except ValueError:  # particles are nowhere: `health.check` finds out since which step
-        return solver.advance(model, s, nbrs, steps)
+        (after, steps), nbrs = advance((s, 0), nbrs)
+    return after, nbrs, steps
 
 
-def _next_moment(scene: Scene, model: Flow, s: State, count: int) -> float | None:
-    """Return the time of the next snapshot [s]; None at the end."""
-    time, step = float(s.time), _step_now(model, s)
-    if time > scene.duration - step / 2:
-        return None
-    interval = scene.duration / count
-    return interval * (math.floor((time + step / 2) / interval) + 1)
-
-
-def _step_now(model: Flow, s: State) -> float:
-    return float(solver.courant(model, s) if model.step is None else model.step)
+def _next_moment(scene: Scene, s: State, count: int) -> float | None:
+    """Return the time of the next snapshot [s]; None at the end. Steps end exactly at these times, as the dtype rounds them."""
+    done = round(float(s.time) * count / scene.duration)
+    return float(np.asarray(scene.duration * (done + 1) / count, s.x.dtype)) if done < count else None
 
 
 def _keep(scene: Scene, model: Flow, s: State, nbrs: Neighbors, folder: Path, step: int, how: How) -> dict[str, float]:
@@ -168,6 +163,8 @@ def _keep(scene: Scene, model: Flow, s: State, nbrs: Neighbors, folder: Path, st
     if how.pictures:
         x, v = np.asarray(s.x), np.asarray(s.v)
         top = max(np.linalg.norm(scene.velocities, axis=1).max(initial=0), line["top_speed"])
+        from jfrnn.sph import frames
+
         frames.draw(scene, x, v, line["time"], float(top), folder / "frames" / f"{step:09d}.png")
     snapshots.save(s, scene, np.asarray(rho), np.asarray(p), folder / "snapshots", step)
     return line

@@ -2,7 +2,7 @@
 
 from jax import Array
 
-from experiments.sph.pairs import Pair, Values
+from jfrnn.sph.pairs import Pair, Values
 
 
 def transport(pair: Pair, i: Values, j: Values, background: Array) -> Array:

@@ -11,10 +11,10 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-from experiments._errors import UsageError
-from experiments.sph import ranges
 from jfrnn.cases import fluids
 from jfrnn.cases.fluids import FluidScene, GasScene, Scene
+from jfrnn.sph import ranges
+from jfrnn.sph.errors import SceneError
 
 SCENES: dict[str, Callable[..., Scene]] = {**fluids.FLUIDS, **fluids.GASES}
 _HINTS = {"Number": float, "Vector": tuple[float, ...]}
@@ -28,16 +28,16 @@ def make_scene(name: str, settings: list[str]) -> Scene:
     """Return a scene with settings "key=value": of the scene's function, or of its physics.
 
     Raises:
-        UsageError: There is no such scene or key, the value is out of its range, or values do not go together.
+        SceneError: There is no such scene or key, the value is out of its range, or values do not go together.
     """
     of_scene, of_physics = parameters(name), physics_of(name)
     chosen: dict[str, dict[str, Any]] = {"scene": {}, "physics": {}}
     for setting in settings:
         key, sign, text = setting.partition("=")
         if not sign:
-            raise UsageError(f"--set {setting}: expected key=value")
+            raise SceneError(f"--set {setting}: expected key=value")
         if key not in of_scene and key not in of_physics:
-            raise UsageError(f"--set {key}: unknown; of {name}: {', '.join(of_scene)}; physics: {', '.join(of_physics)}")
+            raise SceneError(f"--set {key}: unknown; of {name}: {', '.join(of_scene)}; physics: {', '.join(of_physics)}")
         kind = "scene" if key in of_scene else "physics"
         chosen[kind][key] = _value(name, key, text, of_scene.get(key, of_physics.get(key)))
     said = "".join(f" --set {setting}" for setting in settings)
@@ -45,10 +45,10 @@ def make_scene(name: str, settings: list[str]) -> Scene:
         with np.errstate(all="ignore"):  # what is not finite is refused below
             scene: Any = SCENES[name](**chosen["scene"])
     except (ValueError, ZeroDivisionError, OverflowError, MemoryError) as error:
-        raise UsageError(f"scene {name!r}{said}: cannot be made ({error})") from error
+        raise SceneError(f"scene {name!r}{said}: cannot be made ({error})") from error
     scene = replace(scene, physics=replace(scene.physics, **chosen["physics"]))
     if (wrong := _complaint(scene)) is not None:
-        raise UsageError(f"scene {name!r}{said}: {wrong}")
+        raise SceneError(f"scene {name!r}{said}: {wrong}")
     return scene
 
 
@@ -56,10 +56,10 @@ def parameters(name: str) -> dict[str, Any]:
     """Return the settings of a scene's function with their annotations.
 
     Raises:
-        UsageError: There is no such scene.
+        SceneError: There is no such scene.
     """
     if name not in SCENES:
-        raise UsageError(f"unknown fluid scene {name!r}; allowed: {', '.join(SCENES)}")
+        raise SceneError(f"unknown fluid scene {name!r}; allowed: {', '.join(SCENES)}")
     return {key: item.annotation for key, item in inspect.signature(SCENES[name]).parameters.items() if key != "name"}
 
 
@@ -103,7 +103,7 @@ def _value(scene: str, key: str, text: str, kind: Any) -> Any:  # noqa: ANN401
     try:
         return ranges.read(kind, value, ranges.of(scene, key))
     except ValueError as error:
-        raise UsageError(f"--set {key}: got {text!r}; {error}") from error
+        raise SceneError(f"--set {key}: got {text!r}; {error}") from error
 
 
 def with_particles(scene: Scene, path: Path) -> Scene:
@@ -115,26 +115,27 @@ def with_particles(scene: Scene, path: Path) -> Scene:
             then vx, vy, vz and m, if wanted. Velocities are 0 without, masses those of the scene's first particle.
 
     Raises:
-        UsageError: The file cannot be used, or the scene is a gas.
+        SceneError: The file cannot be used, or the scene is a gas.
     """
     if isinstance(scene, GasScene):
-        raise UsageError(f"--initial {path}: says nothing of thermal energies, which scene {scene.name!r} needs; leave it out")
+        raise SceneError(f"--initial {path}: says nothing of thermal energies, which scene {scene.name!r} needs; leave it out")
+    arrays = _read(path, scene.dim)
     try:
-        given = {name: np.asarray(array, np.float64) for name, array in _read(path, scene.dim).items()}
+        given = {name: np.asarray(array, np.float64) for name, array in arrays.items()}
     except (TypeError, ValueError) as error:
-        raise UsageError(f"{path}: holds what are no numbers: {error}") from error
+        raise SceneError(f"{path}: holds what are no numbers: {error}") from error
     positions = given["positions"]
     if positions.ndim != 2 or positions.shape[1] != scene.dim:
-        raise UsageError(f"{path}: positions must have shape [n, {scene.dim}], got {list(positions.shape)}")
+        raise SceneError(f"{path}: positions must have shape [n, {scene.dim}], got {list(positions.shape)}")
     velocities = given.get("velocities", np.zeros_like(positions))
     masses = given.get("masses", np.full(len(positions), scene.masses[0]))
     if velocities.shape != positions.shape or masses.shape != positions.shape[:1]:
-        raise UsageError(f"{path}: velocities {list(velocities.shape)} and masses {list(masses.shape)} must fit the positions")
+        raise SceneError(f"{path}: velocities {list(velocities.shape)} and masses {list(masses.shape)} must fit the positions")
     for name, array in (("positions", positions), ("velocities", velocities), ("masses", masses)):
         if not np.isfinite(array).all():
-            raise UsageError(f"{path}: {name} must be finite; particle {int(np.argwhere(~np.isfinite(array))[0][0])} is not")
+            raise SceneError(f"{path}: {name} must be finite; particle {int(np.argwhere(~np.isfinite(array))[0][0])} is not")
     if len(positions) == 0 or not (masses > 0).all():
-        raise UsageError(f"{path}: expected at least one particle, and masses above 0")
+        raise SceneError(f"{path}: expected at least one particle, and masses above 0")
     return _replace_particles(scene, positions, velocities, masses)
 
 
@@ -147,22 +148,22 @@ def with_solid(scene: Scene, path: Path, scale: float) -> Scene:
         scale: Length of a unit of the file [m].
 
     Raises:
-        UsageError: The file cannot be used, or its triangles lie beside what the scene shows.
+        SceneError: The file cannot be used, or its triangles lie beside what the scene shows.
     """
     if scene.dim != len("xyz"):
-        raise UsageError(f"--solid {path}: triangles are a wall in 3D; {scene.name} is in {scene.dim}D")
+        raise SceneError(f"--solid {path}: triangles are a wall in 3D; {scene.name} is in {scene.dim}D")
     vertices, faces = _read_mesh(path)
     vertices = vertices * scale
     if not (finite := np.isfinite(vertices).all(axis=1)).all():
-        raise UsageError(f"--solid {path}: vertices must be finite; one is {vertices[~finite][0].tolist()}")
+        raise SceneError(f"--solid {path}: vertices must be finite; one is {vertices[~finite][0].tolist()}")
     corners = [scene.positions] if scene.bounds is None else [scene.positions, scene.bounds.lower, scene.bounds.upper]
     (low, high), (least, most) = ((x.min(axis=0), x.max(axis=0)) for x in (np.vstack(corners), vertices))
     size, span = np.max(most - least), np.max(high - low)
     where = f"from {_place(least)} to {_place(most)} m, the scene from {_place(low)} to {_place(high)} m"
     if np.any(least > high) or np.any(most < low):
-        raise UsageError(f"--solid {path}: reaches {where}; move it there, or name its unit: --solid-unit 0.001 for mm")
+        raise SceneError(f"--solid {path}: reaches {where}; move it there, or name its unit: --solid-unit 0.001 for mm")
     if size < scene.spacing or size > _LARGEST_SOLID * span:
-        raise UsageError(f"--solid {path}: is {size:.3g} m long, {where}; name its unit: --solid-unit 0.001 for mm")
+        raise SceneError(f"--solid {path}: is {size:.3g} m long, {where}; name its unit: --solid-unit 0.001 for mm")
     return replace(scene, solid=fluids.Solid(vertices, faces))
 
 
@@ -171,14 +172,14 @@ def _read_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:
     import trimesh
 
     if not path.is_file():
-        raise UsageError(f"--solid {path} is no file: name an STL, OBJ or PLY.")
+        raise SceneError(f"--solid {path} is no file: name an STL, OBJ or PLY.")
     try:
         mesh = trimesh.load(path, force="mesh")  # which merges vertices
     except Exception as error:  # readers of trimesh raise of any kind
         reason = " ".join(str(error).split()) or type(error).__name__
-        raise UsageError(f"--solid {path} is no mesh that trimesh reads ({reason}): name an STL, OBJ or PLY.") from error
+        raise SceneError(f"--solid {path} is no mesh that trimesh reads ({reason}): name an STL, OBJ or PLY.") from error
     if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
-        raise UsageError(f"--solid {path} holds no triangles.")
+        raise SceneError(f"--solid {path} holds no triangles.")
     return np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int32)
 
 
@@ -200,22 +201,22 @@ def _replace_particles(scene: Scene, positions: np.ndarray, velocities: np.ndarr
 
 
 def _read(path: Path, dim: int) -> dict[str, np.ndarray]:
+    if path.suffix not in (".npz", ".csv"):
+        raise SceneError(f"{path}: unknown ending {path.suffix!r}; allowed: .csv, .npz")
     try:
         if path.suffix == ".npz":
             with path.open("rb") as stream, np.load(stream) as file:
                 given = {key: file[key] for key in file}
-        elif path.suffix == ".csv":
+        else:
             table = np.atleast_1d(np.genfromtxt(path, delimiter=",", names=True, dtype=np.float64))
             given = _columns(table, "xyz"[:dim])
-        else:
-            raise UsageError(f"{path}: unknown ending {path.suffix!r}; allowed: .csv, .npz")
     except OSError as error:
         reason = error.strerror or str(error)
-        raise UsageError(f"--initial {path}: cannot be read ({reason}); expected a file .npz or .csv") from error
+        raise SceneError(f"--initial {path}: cannot be read ({reason}); expected a file .npz or .csv") from error
     except (ValueError, TypeError, AttributeError, EOFError, BadZipFile) as error:
-        raise UsageError(f"{path}: cannot be read: {error}") from error
+        raise SceneError(f"{path}: cannot be read: {error}") from error
     if "positions" not in given:
-        raise UsageError(f"{path}: no positions; expected arrays positions, velocities, masses, or columns x, y, vx, vy, m")
+        raise SceneError(f"{path}: no positions; expected arrays positions, velocities, masses, or columns x, y, vx, vy, m")
     return given
 
 

@@ -2,15 +2,11 @@
 
 import numpy as np
 
-from experiments._errors import UsageError
-from experiments.sph import solids, solver
-from experiments.sph.forces import Neighbors
-from experiments.sph.particles import Flow, State
-from jfrnn.cases.fluids import FluidScene, Scene
-
-
-class DivergedError(UsageError):
-    """A run went wrong; the message says in which step, and which particle."""
+from jfrnn.cases.fluids import Scene
+from jfrnn.sph import solids, solver
+from jfrnn.sph.errors import DivergedError
+from jfrnn.sph.pairs import Neighbors
+from jfrnn.sph.particles import Flow, State
 
 
 def complaint(scene: Scene, s: State) -> str | None:
@@ -19,7 +15,7 @@ def complaint(scene: Scene, s: State) -> str | None:
         if name in _WORDS and value is not None and not np.isfinite(value := np.asarray(value)).all():
             particle = int(np.argwhere(~np.isfinite(value))[0][0])
             return f"particle {particle} has {_WORDS[name]} {value[particle]}"
-    distances = solids.clearance(scene, s) if isinstance(scene, FluidScene) else None
+    distances = solids.clearance(scene, s)
     if distances is not None and distances.min(initial=np.inf) <= 0:
         return f"particle {distances.argmin()} went through the wall of triangles, {-distances.min()} m deep"
     if scene.sealed is None:

@@ -1,0 +1,56 @@
+"""A weakly compressible SPH solver on jfrnn, and a gas: a scene says what it has, and exactly that is compiled.
+
+A scene is plain data (`FluidScene`, `GasScene`). `make_model` and `make_state` put it into JAX, `begin`, `step`, `advance` and
+`rollout` make steps of it inside `jax.jit`, and `run` writes snapshots, energies and pictures as it goes. `jfrnn.sph.spread` does
+the same over many devices. On the command line: `python -m jfrnn.sph run SCENE`.
+"""
+
+from jfrnn.cases.fluids import FluidScene, Gas, GasScene, Periodic, Physics, Scene, Solid, Tank, Turning
+from jfrnn.sph.errors import DivergedError, SceneError
+from jfrnn.sph.model import make_model, make_state
+from jfrnn.sph.particles import Model, State
+from jfrnn.sph.runs import How, run
+from jfrnn.sph.settings import make_scene, with_particles, with_solid
+from jfrnn.sph.solver import (
+    advance,
+    advance_until,
+    begin,
+    courant,
+    density_and_pressure,
+    energies,
+    list_neighbors,
+    rollout,
+    step,
+)
+
+__all__ = [
+    "DivergedError",
+    "FluidScene",
+    "Gas",
+    "GasScene",
+    "How",
+    "Model",
+    "Periodic",
+    "Physics",
+    "Scene",
+    "SceneError",
+    "Solid",
+    "State",
+    "Tank",
+    "Turning",
+    "advance",
+    "advance_until",
+    "begin",
+    "courant",
+    "density_and_pressure",
+    "energies",
+    "list_neighbors",
+    "make_model",
+    "make_scene",
+    "make_state",
+    "rollout",
+    "run",
+    "step",
+    "with_particles",
+    "with_solid",
+]
