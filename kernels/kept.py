@@ -10,7 +10,7 @@ that the search has left.
 import functools
 from typing import NamedTuple
 
-from jfrnn.kernels._native import SPACES, program
+from jfrnn.kernels._native import RULES, SPACES, program
 from jfrnn.kernels._program import Entry, Kernel, declare
 from jfrnn.kernels.cells_cuda import GRID
 from jfrnn.kernels.pair_sum_cpu import TermText, constants_of, term_header
@@ -19,7 +19,6 @@ ROWS_AT_ONCE = 64  # that a thread of the CPU takes
 LANES = 8  # of CUDA that serve a row
 _BLOCK = 128
 _BLOCKS, _BLOCKS_IN_BOX = 7, 6  # that share a multiprocessor: more of them, and numbers of a loop leave their registers
-RADII = {"gather": 1, "scatter": 2, "either": 3, "both": 4, "mean": 5, "table": 6}
 
 
 class ListKind(NamedTuple):
@@ -31,7 +30,7 @@ class ListKind(NamedTuple):
         scaled: Whether the cutoff is so small or large that squares need a unit.
         periodic: As in `jfrnn.kernels._native.program`.
         code_bytes: Of the image code of a slot; 0 without.
-        rule: Whose cutoff is that of a pair, one of `RADII`; "" if all have one.
+        rule: Whose cutoff is that of a pair, one of `RULES`; "" if all have one.
         reversed: Whether rows are those of the sources of the list.
         aligned: Whether rows of ids begin at multiples of 16 bytes.
         ordered: Whether an order is given in which rows are taken (CUDA).
@@ -80,7 +79,8 @@ class ListKind(NamedTuple):
     def constants(self, columns: int) -> dict[str, int]:
         """Return the named integers of a program."""
         found = {"PERIODIC": self.periodic, "SCALED": self.scaled, "CODE_BYTES": self.code_bytes, "REVERSED": self.reversed}
-        found |= {"RADII": RADII.get(self.rule, 0), "SUM": self.rule == "mean", "ALIGNED": self.aligned, "ORDERED": self.ordered}
+        found |= {"RULE": RULES.index(self.rule) if self.rule else -1, "SUM": self.rule == "mean"}
+        found |= {"ALIGNED": self.aligned, "ORDERED": self.ordered}
         found |= {"DECIDED": 1, "MEASURED": 0, "APART": 0, "MIRRORED": 0, "OWN": 0, "BOXES": self.boxes, "ITSELF": self.itself}
         return found | {"LENGTH": self.length(columns), "LANES_PER_ROW": max(self.lanes, 1), "QUERY_CHUNK": ROWS_AT_ONCE, **GRID}
 

@@ -195,7 +195,7 @@ def _numbers_of(given: KeptList, cutoff: np.floating | Array) -> Array:
 
 
 def _radii_of(given: KeptList, kind: kept.ListKind) -> tuple[Array | None, Array | None]:
-    """Return the cutoffs beside sources and rows: halves if that of a pair is their mean, 0 if they are not read.
+    """Return the cutoffs beside sources and rows, 0 if they are not read.
 
     With a table these are the species of sources, and where the row of a species begins in the table.
     """
@@ -206,9 +206,8 @@ def _radii_of(given: KeptList, kind: kept.ListKind) -> tuple[Array | None, Array
         beside, own = both[::-1] if kind.reversed else both
         dtype = given.sources.dtype
         return beside.astype(dtype), (own * np.int32(len(table))).astype(dtype)
-    half = given.sources.dtype.type(0.5 if kind.rule == "mean" else 1)
     both = zip((given.cutoff.sources, given.cutoff.queries), (given.sources, given.rows), strict=True)
-    found = [jnp.zeros(len(points), points.dtype) if x is None else x * half for x, points in both]
+    found = [jnp.zeros(len(points), points.dtype) if x is None else x for x, points in both]
     return (found[1], found[0]) if kind.reversed else (found[0], found[1])
 
 

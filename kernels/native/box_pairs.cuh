@@ -33,7 +33,7 @@ struct BoxRun {
 };
 
 struct BoxPairs : BoxArguments, BoxSpace {
-    real inside, outside;  // squares of distances below are surely those of pairs, squares beyond surely not
+    Band<real> of_all;  // pairs, unless cutoffs DIFFER
     int low[3], visited[3];
     int runs;              // of the query
     int query;             // its number
@@ -97,10 +97,7 @@ struct BoxPairs : BoxArguments, BoxSpace {
             counts[k] = k < DIM ? mine[k] : 1;
         first = mine[3];
         slack = 2 * lattice.slack() * step_scale;
-        const real inner = step_radius > slack ? step_radius - slack : real(0), outer = step_radius + slack;
-        const real band = 8 * (1 + PERIODIC) * step_eps;
-        inside = inner * inner * (1 - band);
-        outside = outer * outer * (1 + band);
+        of_all = Bands::of_one(step_radius, slack, Bands::IMAGES);
     }
     JFRNN_MEMBER int fill_value() const { return PERIODIC == 2 ? n * codes : n; }
     JFRNN_MEMBER int name_of(int source, int code) const { return PERIODIC == 2 ? source + n * code : source; }
@@ -232,7 +229,7 @@ struct BoxLanes : BoxPairs {
                     d *= step_scale;
                 square += d * d;
             }
-            PairCutoffs::Bounds<real> bounds{inside, outside};
+            Band<real> bounds = of_all;
             if constexpr (RULE != ONE_CUTOFF)
                 bounds = PairCutoffs::bounds_of(cutoff_at(run.from + (number < run.size ? number : 0)) * step_scale, slack);
             const bool sure = asked & (square < bounds.inside | (RULE != ONE_CUTOFF & number == itself));

@@ -44,7 +44,6 @@ constexpr int LEAF = 16, FANOUT = 16, CLASS_BITS = 1, LEAST_TOGETHER = 6, MOST_T
 constexpr int RULE = 0;
 // Of lists that are kept (see jfrnn/kernels/reverse.py and kept.py).
 constexpr int CODE_BYTES = 1;     // of the code of an image, 0: pairs have one image
-constexpr int RADII = 0;          // whose cutoff is that of a pair (kept.h), 0: all have one
 constexpr bool ITSELF = false;    // a particle is its own neighbor, whatever its cutoff
 constexpr int WIDTH = 3;          // numbers of each slot
 constexpr int LENGTH = 4;         // numbers of each source

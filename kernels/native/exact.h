@@ -1,6 +1,6 @@
 // Where a pair is decided.
 //
-// Step 1 belongs to the kernels: working precision and a band of 8 eps around r^2 (4 on the CPU, see jfrnn/_geometry/exact.py).
+// Step 1 belongs to the kernels: working precision and a band around r^2 (band.h).
 // `Exact::pair` answers for what falls into the band: in twice the precision (float32), then by error-free sums, then in integers as
 // wide as the float format. It is a call, not inlined, so that what it needs is not held in registers elsewhere.
 #pragma once

@@ -2,7 +2,7 @@
 //
 // On CUDA a thread serves a query, on the CPU they are served one after the other. `info` is zeros at first.
 #pragma once
-#include "exact.h"
+#include "band.h"
 #include "row_places.h"
 #include "warp_types.h"
 #include "warp_hashgrid.h"
@@ -16,13 +16,10 @@ struct HashGridArguments : RowsOut {
 };
 
 struct HashGridSearch : HashGridArguments, Space {
-    const real square_radius, sure_square;  // what is closer surely is a neighbor, squared
+    const Band<real> band;
 
     JFRNN_MEMBER explicit HashGridSearch(const HashGridArguments& given)
-        : HashGridArguments(given),
-          Space(given.cutoff),
-          square_radius(step_radius * step_radius),
-          sure_square(square_radius - 8 * step_eps * square_radius) {}
+        : HashGridArguments(given), Space(given.cutoff), band(Bands::of_one(step_radius, real(0), Bands::ONE)) {}
 
     // Copies positions to where the grid is built of them. Those that are not finite are strewn over its cells.
     JFRNN_MEMBER void pack() {
@@ -65,14 +62,14 @@ struct HashGridSearch : HashGridArguments, Space {
     }
     // Decides in working precision, as `PairSearch` does, and where that leaves it open exactly.
     JFRNN_MEMBER bool is_pair(const real* q, const real* p) const {
-        real over = -sure_square;
+        real square = 0;
         for (int k = 0; k < DIM; ++k) {
             real d = p[k] - q[k];
             if constexpr (SCALED)
                 d *= step_scale;
-            over += d * d;
+            square += d * d;
         }
-        return over < 0 || (over <= 16 * step_eps * square_radius && exact_pair(q, p, radius, 0, closed));
+        return square < band.inside || (square <= band.outside && exact_pair(q, p, radius, 0, closed));
     }
 
 #if defined(__CUDACC__)

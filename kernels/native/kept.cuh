@@ -112,6 +112,6 @@ struct KeptLane : Kept {
             p[k] = numbers[k];
             shift[k] = SHIFTED ? (int)verdict.shift[k] : 0;
         }
-        return is_exact_pair(own, p, RADII > OF_ROW ? numbers[RADII > OF_ROW ? RADIUS : 0] : real(0), shift);
+        return is_exact_pair(own, p, DIFFER ? numbers[DIFFER ? RADIUS : 0] : real(0), shift);
     }
 };

@@ -1,7 +1,7 @@
 // Which slots of a list that is kept hold a pair now: one text for a slot, on CUDA, and for LANES of them, on the CPU.
 //
 // Rows of the list have OWN_LENGTH numbers: coordinates as they are, then turns along each axis (PERIODIC == 2), then the cutoff of i
-// (RADII). Sources have LENGTH: coordinates, OTHERS numbers that a term reads, turns and the cutoff of j. `cutoff` holds the largest
+// (DIFFER). Sources have LENGTH: coordinates, OTHERS numbers that a term reads, turns and the cutoff of j. `cutoff` holds the largest
 // cutoff, the lattice, and the largest number of a shift. BOXES: it has such numbers for each of several systems, of which `systems` says
 // to which a row belongs. `steps` are the shifts of image codes, or a 0 where there are none, and behind them the cutoffs of pairs of
 // species behind how many there are, -1 for those that are no neighbors; in place of cutoffs then stand the first place of the row of i,
@@ -12,8 +12,8 @@
 // Source n stands behind all others, and its numbers are NaN: it is what slots hold that are not used, so nobody asks which ones are.
 #pragma once
 #include "codes.h"
-#include "exact.h"
 #include "math.h"
+#include "pair_cutoffs.h"
 
 struct KeptArguments {
     const real *rows, *points, *cutoff, *steps;
@@ -49,19 +49,16 @@ typedef NumberOfSlots<DOUBLE>::type Number;  // one, or LANES of them
 
 constexpr bool CODED = PERIODIC == 2;
 constexpr int TURNS = DIM + OTHERS, RADIUS = TURNS + (CODED ? DIM : 0);  // where they stand among the numbers of a source
-constexpr int OWN_TURNS = DIM, OWN_RADIUS = OWN_TURNS + (CODED ? DIM : 0), OWN_LENGTH = OWN_RADIUS + (RADII > 0);
-constexpr int OF_ROW = 1, OF_SOURCE = 2, LARGER = 3, SMALLER = 4, MEAN = 5,
-              OF_KINDS = 6;  // RADII: the cutoff of a pair; of MEAN halves are given
+constexpr int OWN_TURNS = DIM, OWN_RADIUS = OWN_TURNS + (CODED ? DIM : 0), OWN_LENGTH = OWN_RADIUS + DIFFER;
 
 // Derivatives by positions (KeptSlopes): each slot has the slope of a function by its distance, and in `slots` the slot of the pair the
 // other way round: what both give to the row is along x_j - x_i. Distances below this, whose reciprocal is no float, give nothing.
 constexpr real LEAST_DISTANCE = DOUBLE ? real(0x1p-1022) : real(0x1p-126f);
 
 struct Kept : KeptArguments, Space {
-    static constexpr real LEAST = DOUBLE ? real(0x1p-459) : real(0x1p-40f);  // below, squares of cutoffs might underflow
-    real inside, outside;  // squares below are surely those of pairs, squares above surely not, where all cutoffs are one
-    real moved;            // the most that a shift of 1 along each axis adds up to in a component
-    real most;             // the largest number of a shift for which pairs are decided
+    Band<real> in_space;  // of pairs of points as they are, where all cutoffs are one
+    real moved;           // the most that a shift of 1 along each axis adds up to in a component
+    real most;            // the largest number of a shift for which pairs are decided
     // Where lattice vectors lie along the axes: their lengths, and the reciprocals; 0 where space is open. No store can change them.
     real sides[3], units[3];
 
@@ -70,9 +67,7 @@ struct Kept : KeptArguments, Space {
     // `row` is the first one that is looked at.
     JFRNN_MEMBER explicit Kept(const KeptArguments& given, int row = 0)
         : KeptArguments(given), Space(numbers_of(given, row)), moved(0), most(0), system(BOXES ? given.systems[row] : 0) {
-        // 7 roundings of eps/2, 5 in a square and 2 in a bound (jfrnn/_geometry/exact.py)
-        inside = step_radius * step_radius * (1 - 4 * step_eps);
-        outside = step_radius * step_radius * (1 + 4 * step_eps);
+        in_space = Bands::of_one(step_radius, real(0), Bands::ONE);
         measure_lattice();
         if constexpr (SHIFTED)
             most = cutoff[LATTICE_END];
@@ -131,7 +126,7 @@ struct Kept : KeptArguments, Space {
             if constexpr (CODED)
                 own.turn[k] = from[OWN_TURNS + k];
         }
-        if constexpr (RADII > 0)
+        if constexpr (DIFFER)
             own.radius = from[OWN_RADIUS];
         return own;
     }
@@ -180,28 +175,19 @@ struct Kept : KeptArguments, Space {
             const Number scaled = d[k] * step_scale;
             square = k > 0 ? square + scaled * scaled : scaled * scaled;
         }
-        Number inner = Math::of(inside), outer = Math::of(outside);
-        if constexpr (RADII > 0) {
-            const Number radius = cutoff_of(own, numbers) * step_scale, least = Math::of(LEAST);
-            const Math::flag clear = Math::gt(radius, larger(off, least));
-            const Number near = radius - off, far = larger(radius, least) + off;
-            inner = Math::select(clear, near * near * (1 - 32 * step_eps), Math::of(real(-1)));
-            outer = far * far * (1 + 32 * step_eps);
-        } else if constexpr (SHIFTED) {
-            const Number near = larger(Math::of(step_radius) - off, Number{}), far = Math::of(step_radius) + off;
-            inner = near * near * (1 - 16 * step_eps);
-            outer = far * far * (1 + 16 * step_eps);
-        }
+        Band<Number> band{Math::of(in_space.inside), Math::of(in_space.outside)};
+        if constexpr (DIFFER)
+            band = Bands::bounds_of(Number(cutoff_of(own, numbers) * step_scale), off);
+        else if constexpr (SHIFTED)
+            band = Bands::of_one(Math::of(step_radius), off, Bands::IMAGES);
         Math::flag itself = Math::both(used, Math::both(Math::inverse(other), Math::eq(square, square)));
-        if constexpr (RADII == OF_KINDS)
-            used = Math::both(used, Math::gt(cutoff_of(own, numbers), Number{}));
-        found.sure = Math::both(used, Math::lt(square, inner));
+        found.sure = Math::both(used, Math::lt(square, band.inside));
         if constexpr (ITSELF) {
             if constexpr (SHIFTED)
                 itself = Math::both(itself, Math::le(spans, Number{}));
             found.sure = Math::either(found.sure, itself);
         }
-        found.open = Math::both(Math::both(used, Math::le(square, outer)), Math::inverse(found.sure));
+        found.open = Math::both(Math::both(used, Math::le(square, band.outside)), Math::inverse(found.sure));
         return found;
     }
     // The length of a vector: squares of very small ones would underflow, so these are taken in a unit of their own.
@@ -235,7 +221,7 @@ struct Kept : KeptArguments, Space {
     }
     JFRNN_INLINE Number cutoff_of(const OwnPoint& own, const Number* numbers) const {
         const Number mine = Math::of(own.radius);
-        if constexpr (RADII == OF_KINDS) {
+        if constexpr (RULE == TABLE) {
             const Number place = mine + numbers[RADIUS];
             Number found{};
 #if JFRNN_SCALAR
@@ -246,13 +232,7 @@ struct Kept : KeptArguments, Space {
 #endif
             return found;
         }
-        if constexpr (RADII == OF_ROW)
-            return mine;
-        const Number theirs = numbers[RADII > OF_ROW ? RADIUS : 0];
-        return RADII == OF_SOURCE ? theirs
-               : RADII == LARGER  ? Math::max(mine, theirs)
-               : RADII == SMALLER ? Math::min(mine, theirs)
-                                  : mine + theirs;
+        return PairCutoffs::of_pair(mine, numbers[DIFFER ? RADIUS : 0]);
     }
     // The cutoff of two species, given its place in the table; of slots that are not used, that may be anything.
     JFRNN_MEMBER real cutoff_at(real place) const {
@@ -262,10 +242,9 @@ struct Kept : KeptArguments, Space {
     // Decides exactly about a source at `p`, whose cutoff is `theirs`.
     JFRNN_MEMBER bool is_exact_pair(const OwnPoint& own, const real* p, real theirs, const int* shift) const {
         real r = radius, more = 0;
-        if constexpr (RADII > 0) {
-            const bool first = RADII == OF_ROW || RADII == MEAN || (own.radius > theirs) == (RADII == LARGER);
-            r = RADII == OF_KINDS ? cutoff_at(own.radius + theirs) : RADII != OF_SOURCE && first ? own.radius : theirs;
-            more = RADII == MEAN ? theirs : real(0);
+        if constexpr (DIFFER) {
+            r = RULE == TABLE ? cutoff_at(own.radius + theirs) : SUM ? own.radius / 2 : PairCutoffs::of_pair(own.radius, theirs);
+            more = SUM ? theirs / 2 : real(0);
         }
         if constexpr (!SHIFTED)
             return exact_pair(own.q, p, r, more, closed);

@@ -15,8 +15,8 @@ struct KeptSlots {
 
 template <class Visitor>
 struct KeptRows : Kept {
-    static constexpr bool FLUSHED = !SCALED && RADII == 0;  // else what decides may be so small as to be flushed to zero
-    static constexpr bool PLAIN = !SHIFTED && RADII == 0;   // one cutoff in open space
+    static constexpr bool FLUSHED = !SCALED && !DIFFER;  // else what decides may be so small as to be flushed to zero
+    static constexpr bool PLAIN = !SHIFTED && !DIFFER;   // one cutoff in open space
     const Wide wide;
     int* const next;  // chunk of rows, which threads hand themselves
 
@@ -125,7 +125,7 @@ struct KeptRows : Kept {
                 p[k] = some.numbers[k][l];
                 shift[k] = SHIFTED ? (int)some.verdict.shift[k][l] : 0;
             }
-            const real theirs = RADII > OF_ROW ? some.numbers[RADII > OF_ROW ? RADIUS : 0][l] : real(0);
+            const real theirs = DIFFER ? some.numbers[DIFFER ? RADIUS : 0][l] : real(0);
             pairs |= is_exact_pair(own, p, theirs, shift) ? 1u << l : 0;
         }
         if constexpr (FLUSHED)

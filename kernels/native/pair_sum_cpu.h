@@ -101,7 +101,7 @@ struct SumsBy : Way<SumsBy<Way>> {
     // Evaluates the term for vectors of candidates as they are, under a mask; those in doubt follow.
     template <bool AT_HOME>
     void meet_in_place(const real* q, int id, const Term::Own& own_part, Reduction& reduction) {
-        const Band of_query{inside, outside};
+        const Band<real> of_query{inside, outside};
         const int filled = this->filled;
         const Excluded mine(excluded_starts, excluded, id);
         unsigned int any_unsure = 0;
@@ -141,7 +141,7 @@ struct SumsBy : Way<SumsBy<Way>> {
     // Packs what is near first, so that the term is evaluated for hardly more than the pairs.
     template <bool AT_HOME>
     void meet_packed(const real* q, int id, const Term::Own& own_part, Reduction& reduction) {
-        const Band of_query{inside, outside};
+        const Band<real> of_query{inside, outside};
         const int filled = this->filled;
         const ints numbers = first_numbers();
         const Excluded mine(excluded_starts, excluded, id);

@@ -17,11 +17,6 @@ struct Points {
     vec p[3];
 };
 
-// Squares of distances below `inside` are surely those of pairs, squares beyond `outside` surely not.
-struct Band {
-    real inside, outside;
-};
-
 struct Scan : SearchArguments, SystemCells, SourcePlaces {
     const Wide wide;
     real inside, outside;             // the band of the pairs of a query, unless these VARY
@@ -79,15 +74,11 @@ struct Scan : SearchArguments, SystemCells, SourcePlaces {
             __builtin_memcpy(kind_inside[k], &bounds.inside, sizeof r);
             __builtin_memcpy(kind_outside[k], &bounds.outside, sizeof r);
         }
-        const real inner = step_radius > slack ? step_radius - slack : real(0), outer = step_radius + slack;
-        // 7 roundings of eps/2, 5 in a square and 2 in a bound (jfrnn/_geometry/exact.py). Of images, that of `inner` counts twice:
-        // 4.5 eps. Their band is wider than it need be, since `off` is more than what images may be wrong by, too: no more than 1.74
-        // times the slack, the length of three errors, which would have to be the worst along each axis. Who is in a wider band is
-        // decided exactly.
-        const real band = (PERIODIC ? 8 * (1 + PERIODIC) : 4) * step_eps, unit = shared.unit;
+        const Band<real> band = Bands::of_one(step_radius, slack, PERIODIC ? Bands::IMAGES : Bands::ONE);
+        const real unit = shared.unit;  // of a lattice, on which nothing is between both
         const real between = !SCALED && unit > 0 ? real(square_between(radius, unit, closed)) * unit * unit : real(0);
-        inside = between > 0 ? between : inner * inner * (1 - band);
-        outside = between > 0 ? between : outer * outer * (1 + band);
+        inside = between > 0 ? between : band.inside;
+        outside = between > 0 ? between : band.outside;
     }
 
     // Are all candidates, and all queries, where they were given, and none of them an image? Then no pair has a shift.
@@ -139,24 +130,24 @@ struct Scan : SearchArguments, SystemCells, SourcePlaces {
         return r;
     }
     // The bands of candidates: that of the query, which stays in registers, or one of each. A band is the wider, the longer a cutoff.
-    auto band_at(int b, const Band& of_query) const {
+    auto band_at(int b, const Band<real>& of_query) const {
         if constexpr (BANDED) {
             const vec inside = *(const vec*)(candidate_inside + b), outside = *(const vec*)(candidate_outside + b);
             if constexpr (RULE == SCATTER)
-                return PairCutoffs::Bounds<vec>{inside, outside};
-            return PairCutoffs::Bounds<vec>{
+                return Band<vec>{inside, outside};
+            return Band<vec>{
                 PairCutoffs::of_pair(vec{} + of_query.inside, inside), PairCutoffs::of_pair(vec{} + of_query.outside, outside)};
         } else if constexpr (RULE == TABLE) {
             if (kinds > LANES)
                 return PairCutoffs::bounds_of(vec(radii_at(b) * step_scale), slack);
             const ints kind = *(const ints*)(candidate_kind + b);
-            return PairCutoffs::Bounds<vec>{looked_up(*inside_of_kinds, kind), looked_up(*outside_of_kinds, kind)};
+            return Band<vec>{looked_up(*inside_of_kinds, kind), looked_up(*outside_of_kinds, kind)};
         } else if constexpr (VARY)
             return PairCutoffs::bounds_of(vec(radii_at(b) * step_scale), slack);
         else
             return of_query;
     }
-    auto band_of(const int* numbers, const Band& of_query) const {
+    auto band_of(const int* numbers, const Band<real>& of_query) const {
         if constexpr (VARY)
             return PairCutoffs::bounds_of(vec(radii_of(numbers) * step_scale), slack);
         else
@@ -292,7 +283,7 @@ struct Scan : SearchArguments, SystemCells, SourcePlaces {
     // product and a comparison per axis or candidate, LANES at a time.
     template <bool ONLY_LATER, bool BOUNDED>
     int scan(const real* q, int own_id, int count, int* to, int room) {
-        const Band of_query{inside, outside};  // stays in registers, whatever is stored
+        const Band<real> of_query{inside, outside};  // stays in registers, whatever is stored
         const Excluded mine(excluded_starts, excluded, own_id);
         unsigned int any_unsure = 0;
         int hits = 0;
