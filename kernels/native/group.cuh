@@ -148,7 +148,8 @@ struct Group {
     }
     // Finds what is near the box, and the band in which the sums of `Matrix` leave pairs open.
     JFRNN_MEMBER void set_limits(const PairSearch& search, float diagonal) {
-        const real radius = DIFFER && BY_OWN ? largest : search.radius, between = shared_known().between;
+        const real radius = DIFFER && BY_OWN ? largest : search.radius,
+                   between = search.SITED ? search.between : shared_known().between;
         const real group_radius = (SCALED ? radius * scale : radius) * unit;
         const real outer = CROSSING ? (radius + 2 * search.lattice.slack()) * (SCALED ? scale : real(1)) * unit : group_radius;
         real near_square = outer * outer * (1 + 8 * PairSearch::step_eps) + (DOUBLE ? real(0) : real(1e-30));
@@ -156,8 +157,8 @@ struct Group {
             near_square = near_of(search, largest);
         const float reach = fminf(diagonal * (float)unit + (float)outer, 240);
         float coarse_band = reach * reach * (RULE == TABLE ? 3e-5f : 2e-5f);
-        const float square_unit = (float)(shared_known().site * unit) * (float)(shared_known().site * unit);
-        const bool on_lattice = !DOUBLE && between > 0 && reach < 239 && coarse_band < 0.25f * square_unit;
+        const float site = (float)(shared_known().site * (SCALED ? scale : real(1)) * unit), square_unit = site * site;
+        const bool on_lattice = !DOUBLE && site > 0 && reach < 239 && coarse_band < 0.25f * square_unit;
         if (on_lattice) {
             coarse_square = (float)between * square_unit;
             coarse_band = -1;

@@ -22,13 +22,16 @@ struct PairSearch : ImageSearch {
     real own_radius, upper;  // where cutoffs DIFFER: that of this lane's query, and the longest that a pair of it may have
     const real* of_kinds;    // the cutoffs of its species
     PairCutoffs::Bounds<real> own_bounds;
+    real between;  // what `Known` says of one cutoff, for that of this query
+    // Where coordinates lie on a lattice, cutoffs of queries are decided on it as one cutoff is.
+    static constexpr bool SITED = RULE == GATHER && !TREE;
 
     JFRNN_MEMBER explicit PairSearch(const SearchArguments& given)
-        : ImageSearch(given), own_radius(0), upper(0), of_kinds(nullptr), own_bounds{0, 0} {
+        : ImageSearch(given), own_radius(0), upper(0), of_kinds(nullptr), own_bounds{0, 0}, between(0) {
         Known& known = shared_known();
         if (lane == 0) {
-            known.site = SCALED ? real(0) : shared.unit;
-            known.between = known.site > 0 ? (real)square_between(radius, known.site, closed) : real(0);
+            known.site = !SCALED || SITED ? shared.unit : real(0);
+            known.between = known.site > 0 && !DIFFER ? (real)square_between(radius, known.site, closed) : real(0);
             known.grid = shared.grid;
             known.finite_queries = shared.finite_queries;
             known.longest_before = SUMS ? 0 : *(volatile int*)&info[0];
@@ -53,6 +56,12 @@ struct PairSearch : ImageSearch {
         own_bounds = PairCutoffs::bounds_of(own_radius * step_scale, off());
         sure_square = own_bounds.inside;  // of GATHER
         band = (own_bounds.outside - own_bounds.inside) / 2;
+        const real site = SITED ? shared_known().site : real(0);
+        between = site > 0 ? (real)square_between(own_radius, site, closed) : real(0);
+        if (DOUBLE && site > 0) {
+            sure_square = between * (site * step_scale) * (site * step_scale);
+            band = -1;
+        }
     }
     // Are species so few that tensor cores know the cutoffs of their pairs?
     JFRNN_MEMBER bool few_kinds() const { return RULE == TABLE && kinds <= MOST_KINDS; }
