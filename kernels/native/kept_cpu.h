@@ -28,7 +28,6 @@ struct KeptRows : Kept {
 #if defined(__x86_64__)
         if constexpr (!DOUBLE && LENGTH % 4 == 0) {
             typedef float four __attribute__((vector_size(16)));
-            typedef float eight __attribute__((vector_size(32)));
             for (int c = 0; c < LENGTH; c += 4) {
                 auto row = [&](int l) {
                     four x;
@@ -36,18 +35,13 @@ struct KeptRows : Kept {
                     return x;
                 };
                 auto two = [&](int l) { return __builtin_shufflevector(row(l), row(l + 4), 0, 1, 2, 3, 4, 5, 6, 7); };
-                Number a, b, d, e;
-                if constexpr (LANES == 16) {
-                    auto all = [&](int l) {
-                        const eight low = two(l), high = two(l + 8);
-                        return __builtin_shufflevector(low, high, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
-                    };
-                    a = all(0), b = all(1), d = all(2), e = all(3);
-                    exchange16(a, b, d, e, numbers + c);
-                } else {
-                    a = two(0), b = two(1), d = two(2), e = two(3);
-                    exchange8(a, b, d, e, numbers + c);
-                }
+                auto all = [&](int l) {
+                    if constexpr (LANES == 16)
+                        return __builtin_shufflevector(two(l), two(l + 8), 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
+                    else
+                        return two(l);
+                };
+                exchange(all(0), all(1), all(2), all(3), numbers + c, __make_integer_seq<Lanes, int, LANES>{});
             }
             return;
         }
@@ -56,27 +50,19 @@ struct KeptRows : Kept {
             for (int l = 0; l < LANES; ++l)
                 numbers[c][l] = points[(long long)LENGTH * ids[l] + c];
     }
-    template <class Vector>
-    JFRNN_INLINE static void exchange16(Vector a, Vector b, Vector d, Vector e, Number* to) {
-        const Vector al = __builtin_shufflevector(a, b, 0, 16, 1, 17, 4, 20, 5, 21, 8, 24, 9, 25, 12, 28, 13, 29);
-        const Vector ah = __builtin_shufflevector(a, b, 2, 18, 3, 19, 6, 22, 7, 23, 10, 26, 11, 27, 14, 30, 15, 31);
-        const Vector dl = __builtin_shufflevector(d, e, 0, 16, 1, 17, 4, 20, 5, 21, 8, 24, 9, 25, 12, 28, 13, 29);
-        const Vector dh = __builtin_shufflevector(d, e, 2, 18, 3, 19, 6, 22, 7, 23, 10, 26, 11, 27, 14, 30, 15, 31);
-        to[0] = __builtin_shufflevector(al, dl, 0, 1, 16, 17, 4, 5, 20, 21, 8, 9, 24, 25, 12, 13, 28, 29);
-        to[1] = __builtin_shufflevector(al, dl, 2, 3, 18, 19, 6, 7, 22, 23, 10, 11, 26, 27, 14, 15, 30, 31);
-        to[2] = __builtin_shufflevector(ah, dh, 0, 1, 16, 17, 4, 5, 20, 21, 8, 9, 24, 25, 12, 13, 28, 29);
-        to[3] = __builtin_shufflevector(ah, dh, 2, 3, 18, 19, 6, 7, 22, 23, 10, 11, 26, 27, 14, 15, 30, 31);
-    }
-    template <class Vector>
-    JFRNN_INLINE static void exchange8(Vector a, Vector b, Vector d, Vector e, Number* to) {
-        const Vector al = __builtin_shufflevector(a, b, 0, 8, 1, 9, 4, 12, 5, 13);
-        const Vector ah = __builtin_shufflevector(a, b, 2, 10, 3, 11, 6, 14, 7, 15);
-        const Vector dl = __builtin_shufflevector(d, e, 0, 8, 1, 9, 4, 12, 5, 13);
-        const Vector dh = __builtin_shufflevector(d, e, 2, 10, 3, 11, 6, 14, 7, 15);
-        to[0] = __builtin_shufflevector(al, dl, 0, 1, 8, 9, 4, 5, 12, 13);
-        to[1] = __builtin_shufflevector(al, dl, 2, 3, 10, 11, 6, 7, 14, 15);
-        to[2] = __builtin_shufflevector(ah, dh, 0, 1, 8, 9, 4, 5, 12, 13);
-        to[3] = __builtin_shufflevector(ah, dh, 2, 3, 10, 11, 6, 7, 14, 15);
+    template <class Integer, Integer... L>
+    struct Lanes {};
+    // Exchanges rows and columns of four numbers by four, in all four lanes that follow each other at once.
+    template <class Vector, int... L>
+    JFRNN_INLINE static void exchange(Vector a, Vector b, Vector d, Vector e, Number* to, Lanes<int, L...>) {
+        const Vector al = __builtin_shufflevector(a, b, (L / 4 * 4 + L % 4 / 2 + L % 2 * LANES)...);
+        const Vector ah = __builtin_shufflevector(a, b, (L / 4 * 4 + L % 4 / 2 + L % 2 * LANES + 2)...);
+        const Vector dl = __builtin_shufflevector(d, e, (L / 4 * 4 + L % 4 / 2 + L % 2 * LANES)...);
+        const Vector dh = __builtin_shufflevector(d, e, (L / 4 * 4 + L % 4 / 2 + L % 2 * LANES + 2)...);
+        to[0] = __builtin_shufflevector(al, dl, (L / 4 * 4 + L % 2 + L % 4 / 2 * LANES)...);
+        to[1] = __builtin_shufflevector(al, dl, (L / 4 * 4 + L % 2 + L % 4 / 2 * LANES + 2)...);
+        to[2] = __builtin_shufflevector(ah, dh, (L / 4 * 4 + L % 2 + L % 4 / 2 * LANES)...);
+        to[3] = __builtin_shufflevector(ah, dh, (L / 4 * 4 + L % 2 + L % 4 / 2 * LANES + 2)...);
     }
 
     // Calls `visit` with all entries of a row, LANES at a time; those in doubt are decided.

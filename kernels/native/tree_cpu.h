@@ -152,7 +152,7 @@ struct TreePlaces : TreeSortArguments, SystemCells, TreeScratch {
 
 // One thread, which reads every particle a few times.
 struct TreeSort : TreePlaces {
-    int histogram[KEY_DIGITS][DIGITS];
+    int histogram[DIGITS];
 
     explicit TreeSort(const TreeSortArguments& given) : TreePlaces(given) {}
 
@@ -299,56 +299,48 @@ struct TreeSort : TreePlaces {
             }
             return;
         }
-        memset(histogram, 0, sizeof histogram);
-        for (int i = from; i < to; ++i)
-            for (int d = 0; d < KEY_DIGITS; ++d)
-                ++histogram[d][keys[i] >> (DIGIT * d) & (DIGITS - 1)];
-        unsigned int *read = keys, *write = (unsigned int*)others;
-        int *ids_read = at, *ids_written = order;
+        int *read = key, *write = others, *ids_read = at, *ids_written = order;
         for (int d = 0; d < KEY_DIGITS; ++d) {
-            if (histogram[d][read[from] >> (DIGIT * d) & (DIGITS - 1)] == to - from)
+            auto digit = [&](int i) { return (unsigned int)read[i] >> (DIGIT * d) & (DIGITS - 1); };
+            if (!deal(ids_read, read, ids_written, write, from, to, digit))
                 continue;
-            for (int c = 0, place = from; c < DIGITS; ++c) {
-                const int count = histogram[d][c];
-                histogram[d][c] = place;
-                place += count;
-            }
-            for (int i = from; i < to; ++i) {
-                const int place = histogram[d][read[i] >> (DIGIT * d) & (DIGITS - 1)]++;
-                write[place] = read[i];
-                ids_written[place] = ids_read[i];
-            }
-            unsigned int* const swapped = read;
+            int *const swapped = read, *const swapped_ids = ids_read;
             read = write;
             write = swapped;
-            int* const swapped_ids = ids_read;
             ids_read = ids_written;
             ids_written = swapped_ids;
         }
-        if (read != keys)
-            for (int i = from; i < to; ++i) {
-                keys[i] = read[i];
-                at[i] = ids_read[i];
-            }
+        if (read != key)
+            take_back(at, from, to);
     }
     // Sorts [from, to) of `at` by numbers below DIGITS that `number_of` gives; what is equal stays in order, and so do the keys.
     template <class Number>
     void sort_by_number(int* at, int from, int to, Number number_of) {
-        memset(histogram[0], 0, sizeof histogram[0]);
+        if (deal(at, key, order, others, from, to, [&](int i) { return number_of(at[i]); }))
+            take_back(at, from, to);
+    }
+    // Writes ids and keys of the places [from, to) in the order of numbers below DIGITS, those of places; what is equal stays in order.
+    // Returns false, and writes nothing, where all are equal.
+    template <class Number>
+    bool deal(const int* ids_read, const int* read, int* ids_written, int* write, int from, int to, Number number_of) {
+        memset(histogram, 0, sizeof histogram);
         for (int i = from; i < to; ++i)
-            ++histogram[0][number_of(at[i])];
-        if (from < to && histogram[0][number_of(at[from])] == to - from)
-            return;
+            ++histogram[number_of(i)];
+        if (from == to || histogram[number_of(from)] == to - from)
+            return false;
         for (int c = 0, place = from; c < DIGITS; ++c) {
-            const int count = histogram[0][c];
-            histogram[0][c] = place;
+            const int count = histogram[c];
+            histogram[c] = place;
             place += count;
         }
         for (int i = from; i < to; ++i) {
-            const int place = histogram[0][number_of(at[i])]++;
-            order[place] = at[i];
-            others[place] = key[i];
+            const int place = histogram[number_of(i)]++;
+            ids_written[place] = ids_read[i];
+            write[place] = read[i];
         }
+        return true;
+    }
+    void take_back(int* at, int from, int to) {
         for (int i = from; i < to; ++i) {
             at[i] = order[i];
             key[i] = others[i];
