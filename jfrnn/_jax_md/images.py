@@ -15,6 +15,7 @@ from jfrnn._search import NeighborList as Kept
 from jfrnn._search import flatten, search
 
 Given = Any  # numbers, and arrays of NumPy or JAX
+_theirs = getattr(custom_partition, "neighbor_list_multi_image", None)
 
 
 @jax.tree_util.register_dataclass
@@ -56,7 +57,8 @@ def neighbor_list_multi_image(
 
     Args:
         displacement_or_metric: Not used.
-        box: A matrix [d, d] whose columns are the lattice vectors [length], or edge lengths; d is 2 or 3.
+        box: A matrix [d, d] whose columns are the lattice vectors [length], or edge lengths; d is 2 or 3; for a matrix [1, 1], the
+            function of jax-md is called, where it is installed.
         r_cutoff: As in `neighbor_list`, and dr_threshold, capacity_multiplier and fractional_coordinates likewise.
         dr_threshold: As in `neighbor_list`.
         capacity_multiplier: As in `neighbor_list`.
@@ -73,6 +75,9 @@ def neighbor_list_multi_image(
         ValueError, TypeError: an argument is of the wrong kind, shape or range.
     """
     form, cutoff, skin = check_format(format), float(r_cutoff), float(dr_threshold)
+    if np.shape(box) == (1, 1) and _theirs is not None:
+        given = (displacement_or_metric, box, cutoff, skin, capacity_multiplier, pbc, fractional_coordinates, ordered, form)
+        return _theirs(*given)
     form = OrderedSparse if ordered and form is Sparse else form
 
     def box_of(box: Given, dim: int, like: Box | None = None) -> tuple[Array, Box]:
@@ -114,9 +119,7 @@ def neighbor_list_multi_image(
         position = jnp.asarray(position)
         n, dim = position.shape
         if dim not in (2, 3):
-            raise ValueError(
-                f"position must have shape [n, 2] or [n, 3], got {list(position.shape)}: in 1D take the list of jax-md."
-            )
+            raise ValueError(f"position must have shape [n, 2] or [n, 3], got {list(position.shape)}: in 1D, install jax-md.")
         matrix, made = box_of(box, dim)
         kept = search(position, cutoff, box=made, skin=skin, slack=max(float(capacity_multiplier), 1.0))
         kept.check()

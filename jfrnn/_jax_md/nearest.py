@@ -142,8 +142,8 @@ def neighbor_list(
             space = Space(kwargs.get("box", box), fractional_coordinates)
         elif "box" in kwargs:
             space = Space(kwargs["box"], True)
-        radius, kept = cutoff if exact else reach * dim**0.5, None
-        given = {"include_self": not mask_self, "skin": skin} if exact else {}
+        radius, kept = cutoff if exact else max(reach * dim**0.5 - skin, reach), None
+        given = {"skin": skin, "include_self": exact and not mask_self}
         if dim in (2, 3) and position.dtype in (np.float32, np.float64) and not disable_cell_list:
             given |= {"box": _box_of(space, dim)}
             kept = search(position, radius, slack=max(float(capacity_multiplier), 1.0), **given)
@@ -156,7 +156,7 @@ def neighbor_list(
         extra = extra_capacity if form is Dense else n * extra_capacity
         room = max(min(int(occupancy * capacity_multiplier + extra), most), 0)
         if kept is not None and exact and form is Dense and room > kept.capacity:
-            kept = search(position, cutoff, capacity=room, **given)
+            kept = search(position, radius, capacity=room, **given)
             rows = kept.idx
         idx, held = finish(rows, room, exact)
         error = partition.PartitionError(jnp.where(held > room, 1, 0).astype(jnp.uint8))
@@ -171,23 +171,21 @@ def neighbor_list(
         if fractional_coordinates and kept is not None:
             own = own_space(dim) if exact else None
             present = _box_of(Space(kwargs.get("box", box if own is None else own.box), True), dim)
-        if kept is not None and exact:
-            if _DEFORM & kwargs.keys():
-                raise TypeError(f"update() got {', '.join(_DEFORM & kwargs.keys())}, with which the list was not allocated.")
-            now = kept.update(position, box=present)
-            moved = jnp.asarray(True) if skin == 0 else now.rebuild_count != kept.rebuild_count
-        else:
-            now, away = kept, jax.vmap(functools.partial(squared, **kwargs))(position, neighbors.reference_position)
-            moved = jnp.asarray("box" in kwargs) | ~(away <= (skin / 2) ** 2).all()
+        if exact and _DEFORM & kwargs.keys():
+            raise TypeError(f"update() got {', '.join(_DEFORM & kwargs.keys())}, with which the list was not allocated.")
+        new = None if kept is None else kept.update(position, box=present)
+        moved = new.rebuild_count != kept.rebuild_count if new is not None and kept is not None and skin else jnp.asarray(False)
+        if not exact:
+            away = jax.vmap(functools.partial(squared, **kwargs))(position, neighbors.reference_position)
+            moved = moved | jnp.asarray("box" in kwargs) | ~(away <= (skin / 2) ** 2).all()
 
-        def rebuild() -> tuple[Any, ...]:
-            new = now if exact or kept is None else kept.update(position, box=present)
-            return new, *finish(rows_of(position, new, exact, kwargs), room, exact), position
+        def rebuild() -> tuple[Array, ...]:
+            return *finish(rows_of(position, new, exact, kwargs), room, exact), position
 
-        def keep() -> tuple[Any, ...]:
-            return now, neighbors.idx, neighbors.occupancy, neighbors.reference_position
+        def keep() -> tuple[Array, ...]:
+            return neighbors.idx, neighbors.occupancy, neighbors.reference_position
 
-        new, idx, held, reference = rebuild() if skin == 0 else lax.cond(moved, rebuild, keep)
+        idx, held, reference = rebuild() if skin == 0 else lax.cond(moved, rebuild, keep)
         code = neighbors.error.code | jnp.where(held > room, 1, 0).astype(jnp.uint8)
         code = code if new is None else code | _code_of(new.status)
         error, held = partition.PartitionError(code), jnp.maximum(held, neighbors.occupancy)

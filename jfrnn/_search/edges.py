@@ -29,6 +29,7 @@ from jfrnn._search.exports import flat_pairs, row_offsets
 from jfrnn._search.geometry import ImagesMade, edge_shifts, find_ends, lattice_of_rows, norms, pair_cutoff
 from jfrnn._search.reverse import Reverse
 from jfrnn._search.topology import Topology
+from jfrnn._search.triplets import Triplets, triplets_of
 from jfrnn._tracing import call_apart, compile_program
 
 
@@ -55,6 +56,25 @@ class Edges(NamedTuple):
     status: Array
     distance: Array
     pair_count: Array
+
+    def triplets(self, total: int | None = None, *, half: bool = False) -> Triplets:
+        """Return the pairs of edges that end at the same particle: angles between bonds, differentiable by what edges hold.
+
+        Args:
+            total: The length of the arrays, a static int; default: as many as there are, outside of jit.
+            half: Whether of (j, i, k) and (k, i, j) one is listed, the one whose first edge comes first.
+
+        Returns:
+            `Triplets`: indices of edges, as in `edges.displacement.at[triplets.first].get(mode="clip")`. Those of the padding
+            are beyond the last edge. They are triplets of all neighbors of i if the list is not a half list.
+
+        Raises:
+            TypeError, ValueError: total is not a static int >= 0, or outside of jit too small; half is no bool.
+
+        Cost: 9 B per triplet, one pass. Jit: yes, with `total`; if `triplet_count` exceeds it, triplets are missing.
+        """
+        known = are_whole(self.status) & (self.pair_count <= len(self.senders))
+        return triplets_of(self.receivers, self.mask, known, total, half)
 
 
 class Graph(NamedTuple):

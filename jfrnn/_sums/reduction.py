@@ -95,9 +95,12 @@ def pairs_of_list(
         raise ValueError("neighbors must be a full list for reduce='max', 'min' and compensated=True: search without half=True.")
     sources, rows, box = nbrs._geometry_inputs(positions, queries, box)
     dtype = np.dtype(sources.dtype)
-    if cutoff is not None and (nbrs.cutoff is None or float(check_cutoff(cutoff, dtype).radius) != nbrs.cutoff):
-        has = "a cutoff per particle" if nbrs.cutoff is None else f"cutoff={nbrs.cutoff}"
-        raise ValueError(f"cutoff must be None or that of the list, which has {has}, got {cutoff!r}.")
+    if cutoff is not None:
+        asked = float(check_cutoff(cutoff, dtype).radius)
+        if nbrs.cutoff is None or asked > nbrs.cutoff:
+            has = "a cutoff per particle" if nbrs.cutoff is None else f"cutoff={nbrs.cutoff}"
+            raise ValueError(f"cutoff must be None or at most that of the list, which has {has}, got {cutoff!r}.")
+        nbrs = dataclasses.replace(nbrs, problem=dataclasses.replace(nbrs.problem, cutoff=asked))
     own = nbrs.own_queries
     fixed_rows = lax.stop_gradient(rows)
     directionless = not own and (nbrs.radii is None or nbrs.radii.rule not in EXCHANGED)

@@ -52,7 +52,7 @@ def pair_sum(
             safe at r = 0 (the derivative of sqrt is not).
         positions: Particle positions [length], shape [n, 2] or [n, 3], float32 or float64, or fractional coordinates, as in
             `search`. n = 0 is allowed.
-        cutoff: As in `search`; with `neighbors` that of the list, or None.
+        cutoff: As in `search`; with `neighbors` a number that is at most the cutoff of the list, or None: that of the list.
         values: A pytree of arrays of shape [n, ...]; fn gets leaves [...], of j and, without queries, of i. Default: None.
         query_values: Values of the queries, leaves [m, ...], which fn gets for i. Only with queries.
         reduce: "sum"; or "max" or "min" of each element of fn's result, which must be floats. Rows without neighbors are -inf or
@@ -76,7 +76,7 @@ def pair_sum(
             into the kernel that finds the pairs), or "auto": on the CPU "warp" if it supports the sum, else "jax". "warp" sums
             floats of the dtype of the positions; values and closed-over arrays have that dtype, or are smaller floats, bool, int32
             or (float64) int64. If fn or its derivative has no translation, "auto" warns.
-        neighbors: A list to use instead of a search: its pairs that are closer than its cutoff at these positions, as in
+        neighbors: A list to use instead of a search: its pairs that are closer than the cutoff at these positions, as in
             `NeighborList.vectors`. A half list gives whole sums too. Leave out the options with which it was made. If the list may
             lack pairs (see `NeighborList.check`), this raises outside jit. Over lists that "warp" made, on the CPU and on CUDA, a
             kernel reads the rows and evaluates the translated fn, with cutoffs per particle too; over others, and with a warning

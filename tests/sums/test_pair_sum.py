@@ -944,7 +944,7 @@ def listed(**options):
         (ValueError, "backend was said when the list was made", lambda: pair_sum(neighbors=listed(), backend="jax")),
         (
             ValueError,
-            "cutoff must be None or that of the list, which has cutoff=1.0, got 2.0",
+            "cutoff must be None or at most that of the list, which has cutoff=1.0, got 2.0",
             lambda: jfrnn.pair_sum(lambda r, i, j: r, X, 2.0, neighbors=listed()),
         ),
         (
@@ -961,3 +961,24 @@ def listed(**options):
 def test_errors(error, match, call):
     with pytest.raises(error, match=match):
         call()
+
+
+@pytest.mark.parametrize("backend", ["warp", pytest.param("jax", marks=SLOW)])
+def test_a_list_with_a_shorter_cutoff(backend):
+    """A list serves two cutoffs: its own pairs, and those of a shorter one, with derivatives."""
+    x, short = jnp.asarray(np.random.default_rng(8).random((60, 3))), 0.2
+    options = {"box": jfrnn.Box([1.0, 1.0, 1.0]), "backend": backend}
+    nbrs, moved = jfrnn.search(x, 0.35, skin=0.05, **options), x + 0.01 * jnp.sin(40 * x)
+
+    def total(x, **given):
+        return jfrnn.pair_sum(lambda r, i, j: 1 + jnp.exp(-(r @ r)), x, short, **given).sum()
+
+    found = jax.jit(lambda x, nbrs: jax.value_and_grad(total)(x, neighbors=nbrs))(moved, nbrs)
+    away = np.asarray(moved)[:, None] - np.asarray(moved)
+    away -= np.round(away)
+    squared = (away**2).sum(2)
+    term = np.where((squared < short**2) & ~np.eye(60, dtype=bool), np.exp(-squared), 0)
+    pairs = np.count_nonzero(term)
+    assert pairs > 50
+    np.testing.assert_allclose(found[0], pairs + term.sum(), rtol=1e-12)
+    np.testing.assert_allclose(found[1], -4 * (term[..., None] * away).sum(1), atol=1e-12)
