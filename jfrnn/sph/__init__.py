@@ -6,11 +6,13 @@ the same over many devices. On the command line: `python -m jfrnn.sph run SCENE`
 """
 
 from jfrnn.cases.fluids import FluidScene, Gas, GasScene, Periodic, Physics, Scene, Solid, Tank, Turning
+from jfrnn.sph.check import check_scene
 from jfrnn.sph.errors import DivergedError, SceneError
+from jfrnn.sph.files import read_solid, with_particles, with_solid
 from jfrnn.sph.model import make_model, make_state
 from jfrnn.sph.particles import Model, State
 from jfrnn.sph.runs import How, run
-from jfrnn.sph.settings import make_scene, with_particles, with_solid
+from jfrnn.sph.settings import make_scene
 from jfrnn.sph.solver import (
     advance,
     advance_until,
@@ -41,6 +43,7 @@ __all__ = [
     "advance",
     "advance_until",
     "begin",
+    "check_scene",
     "courant",
     "density_and_pressure",
     "energies",
@@ -48,6 +51,7 @@ __all__ = [
     "make_model",
     "make_scene",
     "make_state",
+    "read_solid",
     "rollout",
     "run",
     "step",

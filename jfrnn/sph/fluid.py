@@ -11,6 +11,7 @@ from jax import Array
 import jfrnn
 from jfrnn.cases.fluids import FluidScene, Physics
 from jfrnn.sph import budget, forces, solids, walls
+from jfrnn.sph.errors import SceneError
 from jfrnn.sph.forces import density_and_pressure
 from jfrnn.sph.kernels import KERNELS
 from jfrnn.sph.pairs import Neighbors, reach
@@ -25,7 +26,7 @@ def make_model(scene: FluidScene, dtype: type, backend: str) -> Model:
     """Put what acts in a fluid into JAX, numbers of one dtype.
 
     Raises:
-        ValueError: A periodic box is too small for the kernel, or parts of the physics do not go together.
+        SceneError: A periodic box is too small for the kernel, or parts of the physics do not go together.
     """
 
     def array(value: Any) -> Array:  # noqa: ANN401
@@ -58,7 +59,7 @@ def _check_box(scene: FluidScene) -> None:
     least = 2.05 * reach(KERNELS[scene.physics.kernel], scene.physics.smoothing)
     for axis, length, periodic in zip("xyz", scene.periodic.lengths, scene.periodic.axes, strict=False):
         if periodic and length < least:
-            raise ValueError(
+            raise SceneError(
                 f"periodic box must be 2.05 cutoffs wide along {axis}: {least:.6g} m, got {length:.6g} m: take more particles."
             )
 
@@ -67,16 +68,16 @@ def _check_parts(scene: FluidScene) -> None:
     """Refuse what does not compile, or compiles and means nothing."""
     physics = scene.physics
     if physics.integrator == "leapfrog" and physics.evolve != "summation":
-        raise ValueError(
+        raise SceneError(
             f"integrator 'leapfrog' carries no density or pressure, got evolve {physics.evolve!r}: "
             "take evolve 'summation', or integrator 'symplectic' or 'midpoint'."
         )
     if scene.tank is not None and physics.restitution is None:
-        raise ValueError("restitution must be a number from 0 to 1 in a tank, got None: take 1 for walls that take no speed away.")
+        raise SceneError("restitution must be a number from 0 to 1 in a tank, got None: take 1 for walls that take no speed away.")
     if scene.solid is not None:
         _check_solid(physics)
     if physics.pressure == "difference" and scene.periodic is None and scene.wall is None:
-        raise ValueError(
+        raise SceneError(
             "pressure 'difference' does not vanish at a free surface, got a scene without walls or period: "
             "take 'mean', 'symmetric' or 'volume'."
         )
@@ -90,19 +91,19 @@ def _check_solid(physics: Physics[float, tuple[float, ...]]) -> None:
         ("pressure", ("mean", "symmetric", "volume")),
     ):
         if getattr(physics, name) not in allowed:
-            raise ValueError(f"{name} must be {' or '.join(map(repr, allowed))} beside a solid, got {getattr(physics, name)!r}.")
+            raise SceneError(f"{name} must be {' or '.join(map(repr, allowed))} beside a solid, got {getattr(physics, name)!r}.")
     for name in ("transport", "shifting", "surface_tension"):
         if getattr(physics, name) is not None:
-            raise ValueError(f"{name} must be None beside a solid, whose surface it does not know, got {getattr(physics, name)}.")
+            raise SceneError(f"{name} must be None beside a solid, whose surface it does not know, got {getattr(physics, name)}.")
     if physics.corrected:
-        raise ValueError("corrected must be False beside a solid: what it corrects is what the wall lacks in particles.")
+        raise SceneError("corrected must be False beside a solid: what it corrects is what the wall lacks in particles.")
 
 
 def make_state(scene: FluidScene, dtype: type) -> State:
     """Put the particles of a fluid into JAX, where they are at first.
 
     Raises:
-        ValueError: The solid is not closed, or holds a particle.
+        SceneError: The solid is not closed, or holds a particle.
     """
     physics = scene.physics
     x, v = jnp.asarray(scene.positions, dtype), jnp.asarray(scene.velocities, dtype)

@@ -13,6 +13,7 @@ from jax import Array
 
 from jfrnn.cases.fluids import GasScene
 from jfrnn.sph import budget
+from jfrnn.sph.errors import SceneError
 from jfrnn.sph.pairs import Neighbors, Pair, Values, total_of_own
 from jfrnn.sph.particles import GasModel, State, Thermal
 
@@ -36,11 +37,11 @@ def make_model(scene: GasScene, dtype: type, backend: str) -> GasModel:
     """Put what acts in a gas into JAX, numbers of one dtype.
 
     Raises:
-        ValueError: The scene has what a gas here has not: walls, a box, particles that enter.
+        SceneError: The scene has what a gas here has not: walls, a box, particles that enter.
     """
     for name in _NOT_THERE:
         if getattr(scene, name) is not None:
-            raise ValueError(f"{name} must be None in a scene of a gas, which is in open space, got {getattr(scene, name)!r}.")
+            raise SceneError(f"{name} must be None in a scene of a gas, which is in open space, got {getattr(scene, name)!r}.")
 
     def array(value: Any) -> Array:  # noqa: ANN401
         return jnp.asarray(value, dtype)

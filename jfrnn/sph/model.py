@@ -8,6 +8,7 @@ from jax import Array
 import jfrnn
 from jfrnn.cases.fluids import FluidScene, GasScene, Scene
 from jfrnn.sph import fluid, gas
+from jfrnn.sph.check import check_scene
 from jfrnn.sph.pairs import Neighbors
 from jfrnn.sph.particles import Beside, Flow, GasModel, Model, State
 
@@ -71,8 +72,9 @@ def make_model(scene: Scene, dtype: type = np.float64, backend: str = "auto") ->
     """Put what acts in a scene into JAX, numbers of one dtype.
 
     Raises:
-        ValueError: A periodic box is too small for the kernel, or parts of the physics do not go together; or as `gas.make_model`.
+        SceneError: As `check_scene`; or a periodic box is too small for the kernel, or parts of the physics do not go together.
     """
+    check_scene(scene)
     return kind_of(scene).make_model(scene, dtype, backend)
 
 
@@ -80,6 +82,7 @@ def make_state(scene: Scene, dtype: type = np.float64) -> State:
     """Put the particles of a scene into JAX, where they are at first; `solver.begin` does the rest.
 
     Raises:
-        ValueError: The solid is not closed, or holds a particle.
+        SceneError: As `check_scene`; or the solid is not closed, or holds a particle.
     """
+    check_scene(scene)
     return kind_of(scene).make_state(scene, dtype)

@@ -1,9 +1,11 @@
 """Run a scene: in chunks of steps, a snapshot, a line of energies and a picture after each, from the last snapshot on."""
 
 import hashlib
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
+from typing import Any
 
 import jax
 import numpy as np
@@ -13,6 +15,7 @@ import jfrnn
 from jfrnn.cases.fluids import GasScene, Scene
 from jfrnn.sph import forces, health, settings, snapshots, solids, solver
 from jfrnn.sph.errors import SceneError
+from jfrnn.sph.interrupts import hold_interrupts
 from jfrnn.sph.model import make_model, make_state
 from jfrnn.sph.pairs import Neighbors
 from jfrnn.sph.particles import Flow, State
@@ -38,7 +41,7 @@ class How:
     pictures: bool = True
 
 
-MOST_STEPS = 2000  # between two looks at a run
+SECONDS, MOST_STEPS = 0.5, 100_000  # between two looks at a run
 MOST_FOR_LISTS = 1 << 18  # particles up to which sums over a list are faster on a GPU; see `faster_way`
 
 
@@ -51,8 +54,10 @@ def faster_way(platform: str, particles: int) -> str:
     return "list" if platform != "cpu" and particles <= MOST_FOR_LISTS else "pair_sum"
 
 
-def run(scene: Scene, folder: Path, how: How) -> State:
+def run(scene: Scene, folder: Path | str, how: How = How()) -> State:
     """Run a scene from its beginning, or from the last snapshot of the folder, to its end.
+
+    Ctrl-C stops it between two steps; the same call then goes on from the last snapshot, to the same end.
 
     Args:
         scene: The scene.
@@ -65,41 +70,60 @@ def run(scene: Scene, folder: Path, how: How) -> State:
     Raises:
         SceneError: The folder holds another run, or the scene cannot be run.
         DivergedError: A particle is not finite, or went through a wall.
+        KeyboardInterrupt: Ctrl-C came.
     """
-    about = settings.describe(scene) | {"dtype": how.dtype, "frames": how.frames, "given": _digest(scene)}
-    dtype = np.dtype(how.dtype).type
-    try:
-        model, first = make_model(scene, dtype), make_state(scene, dtype)  # what is refused leaves no folder
-    except ValueError as error:
-        raise SceneError(f"scene {scene.name!r}: {error}") from error
-    snapshots.check_same(about, folder)
-    saved = snapshots.latest(folder / "snapshots", scene)
-    s, step = saved or (first, 0)
-    nbrs = _first_neighbors(scene, model, s, how)
-    if saved is None:
-        s = jax.jit(solver.begin)(model, s, nbrs)
-        _keep(scene, model, s, nbrs, folder, step, how)
-    progress = Progress(how.frames, round(how.frames * float(s.time) / scene.duration))
-    while (goal := _next_moment(scene, s, how.frames)) is not None:
-        start, before_it = perf_counter(), step
-        while float(s.time) < goal:
-            before, nbrs_before = s, nbrs
-            s, nbrs, steps = _chunk(model, s, nbrs, goal)
-            jax.block_until_ready(s.x)
-            health.check(scene, model, before, nbrs_before, s, steps, step)
-            if isinstance(nbrs, jfrnn.NeighborList):
-                nbrs.check()
-            step += steps
-        seconds = perf_counter() - start
-        line = _keep(scene, model, s, nbrs, folder, step, how)
-        text = f"{scene.name}: t {line['time']:.4g} s, {(step - before_it) / seconds:.0f} steps/s, energy {line['total']:.4g} J"
-        progress.advance(text + ("" if nbrs is None else f", {int(nbrs.rebuild_count)} rebuilds"))
-    progress.end()
-    if how.pictures:
-        from jfrnn.sph import frames
+    folder, dtype = Path(folder), np.dtype(how.dtype).type
+    with hold_interrupts() as stopped:
+        try:
+            model, first = make_model(scene, dtype), make_state(scene, dtype)  # what is refused leaves no folder
+        except SceneError as error:
+            raise SceneError(f"scene {scene.name!r}: {error}") from error
+        snapshots.check_same(_describe(scene, how), folder)
+        saved = snapshots.latest(folder / "snapshots", scene)
+        s, step = saved or (first, 0)
+        nbrs = _first_neighbors(scene, model, s, how)
+        if saved is None:
+            s = jax.jit(solver.begin)(model, s, nbrs)
+            _keep(scene, model, s, nbrs, folder, step, how)
+        progress = Progress(how.frames, round(how.frames * float(s.time) / scene.duration))
+        while (goal := _next_moment(scene, s, how.frames)) is not None:
+            start, step_before = perf_counter(), step
+            s, nbrs, step = _go_to(goal, scene, model, s, nbrs, step, stopped)
+            seconds = perf_counter() - start
+            line = _keep(scene, model, s, nbrs, folder, step, how)
+            rate = f"{(step - step_before) / seconds:.0f} steps/s"
+            text = f"{scene.name}: t {line['time']:.4g} s, {rate}, energy {line['total']:.4g} J"
+            progress.advance(text + ("" if nbrs is None else f", {int(nbrs.rebuild_count)} rebuilds"))
+        progress.end()
+        if how.pictures:
+            from jfrnn.sph import frames
 
-        frames.animate(folder / "frames", folder / f"{scene.name}.gif")
+            frames.animate(folder / "frames", folder / f"{scene.name}.gif")
     return s
+
+
+def _go_to(
+    goal: float, scene: Scene, model: Flow, s: State, nbrs: Neighbors, step: int, stopped: Callable[[], bool]
+) -> tuple[State, Neighbors, int]:
+    """Run steps to a time [s], looking after about half a second whether all is well, and whether the user stops it."""
+    most = 1
+    while float(s.time) < goal:
+        if stopped():
+            raise KeyboardInterrupt
+        start, before, nbrs_before = perf_counter(), s, nbrs
+        s, nbrs, steps = _chunk(model, s, nbrs, goal, most)
+        jax.block_until_ready(s.x)
+        most = max(1, min(round(SECONDS * steps / (perf_counter() - start)), MOST_STEPS))
+        health.check(scene, model, before, nbrs_before, s, steps, step)
+        if isinstance(nbrs, jfrnn.NeighborList):
+            nbrs.check()
+        step += steps
+    return s, nbrs, step
+
+
+def _describe(scene: Scene, how: How) -> dict[str, Any]:
+    """Return what a run must have in common with one that it goes on with."""
+    return settings.describe(scene) | {"dtype": how.dtype, "frames": how.frames, "given": _digest(scene)}
 
 
 def _first_neighbors(scene: Scene, model: Flow, s: State, how: How) -> Neighbors:
@@ -123,23 +147,23 @@ def _digest(scene: Scene) -> str:
     return hashlib.sha256(b"".join(np.ascontiguousarray(a).tobytes() for a in arrays)).hexdigest()[:12]
 
 
-def _chunk(model: Flow, s: State, nbrs: Neighbors, goal: float) -> tuple[State, Neighbors, int]:
-    """Run steps to a time [s], at most `MOST_STEPS`, and return their number; where a row of a list overflowed, all again."""
+def _chunk(model: Flow, s: State, nbrs: Neighbors, goal: float, most: int) -> tuple[State, Neighbors, int]:
+    """Run steps to a time [s], at most so many, and return their number; where a row of a list overflowed, all again."""
     while True:
-        after, seen, steps = _chunk_of_particles(model, s, nbrs, goal)
+        after, seen, steps = _chunk_of_particles(model, s, nbrs, goal, most)
         if s.solid is None or after.solid is None or not after.solid.tri.overflow:
             return after, seen, int(steps)
         larger = after.solid.tri.grow(solids.into_frame(s.x, model.turning, s.solid.angle))
         s = s._replace(solid=s.solid._replace(tri=larger))
 
 
-def _chunk_of_particles(model: Flow, s: State, nbrs: Neighbors, goal: float) -> tuple[State, Neighbors, Array | int]:
+def _chunk_of_particles(model: Flow, s: State, nbrs: Neighbors, goal: float, most: int) -> tuple[State, Neighbors, Array | int]:
     if nbrs is None:
-        return solver.advance_until(model, s, None, goal, MOST_STEPS)
+        return solver.advance_until(model, s, None, goal, most)
     active = None if model.enters is None else lambda carry: forces.active(model, carry[0].time)
 
     def advance(carry: tuple[State, Array | int], nbrs: Neighbors) -> tuple[tuple[State, Array | int], Neighbors]:
-        after, nbrs, steps = solver.advance_until(model, carry[0], nbrs, goal, MOST_STEPS)
+        after, nbrs, steps = solver.advance_until(model, carry[0], nbrs, goal, most)
         return (after, steps), nbrs
 
     try:
