@@ -35,7 +35,7 @@ def check_scene(scene: Scene) -> None:
     for name in ("spacing", "duration"):
         _check_number(name, getattr(scene, name))
     _check_steps(scene)
-    for name, place in (("tank", scene.tank), ("bounds", scene.bounds), ("sealed", scene.sealed)):
+    for name, place in (("tank", scene.tank), ("bounds", scene.bounds), ("sealed", scene.sealed), ("outflow", scene.outflow)):
         if place is not None:
             _check_corners(name, place.lower, place.upper, scene.dim)
     if scene.periodic is not None:

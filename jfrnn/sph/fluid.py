@@ -15,14 +15,14 @@ from jfrnn.sph.errors import SceneError
 from jfrnn.sph.forces import density_and_pressure
 from jfrnn.sph.kernels import KERNELS
 from jfrnn.sph.pairs import Neighbors, reach
-from jfrnn.sph.particles import Model, State
+from jfrnn.sph.particles import Force, Model, State, active
 
 __all__ = ["begin", "beside", "courant", "density_and_pressure", "energies", "list_neighbors", "make_model", "make_state", "step"]
 
 beside = solids.begin
 
 
-def make_model(scene: FluidScene, dtype: type, backend: str) -> Model:
+def make_model(scene: FluidScene, dtype: type, backend: str, force: Force | None) -> Model:
     """Put what acts in a fluid into JAX, numbers of one dtype.
 
     Raises:
@@ -49,6 +49,8 @@ def make_model(scene: FluidScene, dtype: type, backend: str) -> Model:
         fluid_count=None if scene.wall is None else _first_wall(scene.wall),
         backend=backend,
         turning=solids.turning_of(scene, dtype),
+        outflow=scene.outflow and (array(scene.outflow.lower), array(scene.outflow.upper)),
+        force=force,
     )
 
 
@@ -109,6 +111,8 @@ def make_state(scene: FluidScene, dtype: type) -> State:
     x, v = jnp.asarray(scene.positions, dtype), jnp.asarray(scene.velocities, dtype)
     zero = jnp.zeros((), dtype)
     state = State(x, v, zero, jnp.zeros_like(x), zero, solid=solids.begin(scene, x))
+    if scene.outflow is not None:
+        state = state._replace(gone=jnp.zeros(scene.n, bool))
     if physics.transport is not None or physics.shifting is not None:
         state = state._replace(w=jnp.zeros_like(x))
     if physics.evolve == "continuity":
@@ -159,7 +163,7 @@ def _greatest(vectors: Array) -> Array:
 
 def list_neighbors(model: Model, s: State, skin: float, slack: float) -> jfrnn.NeighborList:
     """Return a neighbor list with a skin [m], and slots for `slack` times the longest row."""
-    return jfrnn.search(s.x, model.cutoff, box=model.box, active=forces.active(model, s.time), skin=skin, slack=slack)
+    return jfrnn.search(s.x, model.cutoff, box=model.box, active=active(model, s), skin=skin, slack=slack)
 
 
 def energies(model: Model, s: State) -> dict[str, Array]:
@@ -169,11 +173,23 @@ def energies(model: Model, s: State) -> dict[str, Array]:
 
 def step(model: Model, s: State, dt: Array, nbrs: Neighbors) -> tuple[State, Neighbors]:
     """Advance by a time step [s] as the physics says; the list, where there is one, is updated."""
-    return _INTEGRATORS[model.physics.integrator](model, s, dt, nbrs)
+    s, nbrs = _INTEGRATORS[model.physics.integrator](model, s, dt, nbrs)
+    return (s if s.gone is None or model.outflow is None else _let_go(model, s, s.gone, *model.outflow)), nbrs
+
+
+def _let_go(model: Model, s: State, gone: Array, lower: Array, upper: Array) -> State:
+    """Return the state without the particles of the fluid that are outside of the corners [m]; they rest where they left."""
+    outside = jnp.any((s.x < lower) | (s.x > upper), axis=1)
+    if model.wall is not None:
+        outside = outside & ~model.wall
+    if model.enters is not None:
+        outside = outside & (s.time >= model.enters)
+    gone = gone | outside
+    return s._replace(gone=gone, v=jnp.where(gone[:, None], 0, s.v), a=jnp.where(gone[:, None], 0, s.a))
 
 
 def _update(model: Model, s: State, nbrs: Neighbors) -> Neighbors:
-    return None if nbrs is None else nbrs.update(s.x, active=forces.active(model, s.time))
+    return None if nbrs is None else nbrs.update(s.x, active=active(model, s))
 
 
 def _evaluate(model: Model, s: State, nbrs: Neighbors, dt: Array | None = None) -> State:
@@ -206,7 +222,7 @@ def _besides(model: Model, sums: Array | None, dt: Array) -> Array | None:
 
 def _transport_velocity(model: Model, s: State) -> Array:
     """Return the velocities with which positions change; dummies of walls stay, their velocity is along the wall."""
-    return walls.keep_fluid(forces.are_resting(model, s.time), s.v if s.w is None else s.v + s.w)
+    return walls.keep_fluid(forces.are_resting(model, s), s.v if s.w is None else s.v + s.w)
 
 
 def _bounce(model: Model, s: State) -> State:
@@ -233,7 +249,7 @@ def _symplectic(model: Model, s: State, dt: Array, nbrs: Neighbors) -> tuple[Sta
     """
     s = s._replace(v=s.v + dt / 2 * s.a)
     moved = s.x + dt * _transport_velocity(model, s)
-    s = s._replace(x=moved) if s.solid is None else solids.keep_out(model, s, moved, s.v, dt, forces.are_resting(model, s.time))
+    s = s._replace(x=moved) if s.solid is None else solids.keep_out(model, s, moved, s.v, dt, forces.are_resting(model, s))
     s = _bounce(model, s)
     nbrs = _update(model, s, nbrs)
     s = _evaluate(model, s, nbrs, dt)

@@ -24,7 +24,7 @@ from jfrnn.cases.fluids import FluidScene, Scene, Turning
 from jfrnn.sph.errors import SceneError
 from jfrnn.sph.kernels import KERNELS, Kernel
 from jfrnn.sph.pairs import reach
-from jfrnn.sph.particles import Beside, Model, State
+from jfrnn.sph.particles import Beside, Model, State, active
 
 GAP = 0.2  # particle spacings: on a lattice, particles at a wall are half a spacing away
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
@@ -203,7 +203,8 @@ class _Acting(NamedTuple):
 
 
 def _find_acting(model: Model, s: State, beside: Beside) -> _Acting:
-    mask = beside.mask if model.enters is None else beside.mask & (s.time >= model.enters)
+    there = active(model, s)
+    mask = beside.mask if there is None else beside.mask & there
     distance = jnp.where(mask, jnp.maximum(beside.distance, 0), 0)
     sums = integrate_missing(model.kernel, distance, model.physics.smoothing, s.x.shape[1])
     area, weight = (jnp.where(mask, part, 0) for part in sums)

@@ -196,3 +196,18 @@ def test_walls_show_hydrostatic_pressure_and_hold_the_fluid():
     assert met.sum() == 20
     np.testing.assert_allclose(shown[met], 1000.0 * 9.81 * (1 - x[met, 1]), rtol=1e-12)
     np.testing.assert_allclose(held[met], np.broadcast_to([-0.6, 0.0], (20, 2)), atol=1e-12)
+
+
+def test_what_walls_show_has_derivatives_where_they_barely_meet_the_fluid():
+    """Weights whose squares are below the least float32 are those of no neighbor."""
+
+    ones = jnp.ones(2, jnp.float32)
+
+    def shown(weight):
+        sums = {"weight": weight, "p": weight * 1e3, "v": weight[:, None] * ones, "moment": weight[:, None] * ones}
+        pressure, velocity = walls.extrapolate(sums, jnp.zeros((3, 2), jnp.float32), jnp.array([0.0, -9.81], jnp.float32))
+        return jnp.sum(pressure) + jnp.sum(velocity)
+
+    weights = jnp.array([1e-30, 1e-15, 1.0], jnp.float32)
+    assert np.isfinite(jax.grad(shown)(weights)).all()
+    assert np.isfinite(shown(weights))
