@@ -120,6 +120,8 @@ class Scene:
             are none.
         enters: When each particle enters [s], shape [n]; until then it waits and takes no part. None: all are there.
         guided: How long a particle that entered keeps its velocity [s], whatever acts on it.
+        outflow: Lower and upper corner [m] of what particles of the fluid leave for good, infinite where they cannot; None: they
+            stay.
         densities: Densities at first [kg/m³], shape [n], where they are carried; None: the rest density.
         pressures: Pressures at first [Pa], shape [n], where they are carried; None: 0.
         solid: A wall of triangles, outside of which the fluid is; None: there is none.
@@ -139,6 +141,7 @@ class Scene:
     sealed: Tank | None = None
     enters: NDArray[np.float64] | None = None
     guided: float = 0.0
+    outflow: Tank | None = None
     densities: NDArray[np.float64] | None = None
     pressures: NDArray[np.float64] | None = None
     solid: Solid | None = None
@@ -218,6 +221,26 @@ class Solid:
     vertices: NDArray[np.float64]
     faces: NDArray[np.int32]
     turning: Turning[float, Floats] | None = None
+
+
+def inflow(
+    layer: NDArray[np.float64], velocity: Sequence[float], spacing: float, duration: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Return particles that enter layer by layer, each a spacing behind the one before.
+
+    Args:
+        layer: Where the particles of a layer enter [m], shape [k, d].
+        velocity: With which they do [m/s], d numbers.
+        spacing: Particle distance [m].
+        duration: How long they come [s].
+
+    Returns:
+        Positions and velocities, shape [layers · k, d], and when each enters [s], shape [layers · k]: for `Scene`.
+    """
+    speed = float(np.linalg.norm(velocity))
+    enters = np.arange(int(duration * speed / spacing), dtype=np.float64) * spacing / speed
+    positions = np.tile(layer, (len(enters), 1))
+    return positions, np.broadcast_to(np.asarray(velocity, float), positions.shape).copy(), np.repeat(enters, len(layer))
 
 
 def lattice(lower: Sequence[float], counts: Sequence[int], spacing: float) -> NDArray[np.float64]:

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ._fluid import Floats, FluidScene, Physics, Tank, lattice
+from ._fluid import Floats, FluidScene, Physics, Tank, inflow, lattice
 
 LAYERS = 3  # of wall dummies: as far as a Wendland kernel with h = 1.5 dx reaches
 
@@ -189,8 +189,7 @@ def jet(
     spacing = diameter / layers
     disc = lattice((-diameter / 2,) * 2, (layers, layers), spacing)
     disc = disc[(disc**2).sum(axis=1) <= diameter**2 / 4]
-    enters = np.arange(int(duration * speed / spacing), dtype=np.float64) * spacing / speed
-    oil = np.tile(np.column_stack([disc, np.full(len(disc), height)]), (len(enters), 1))
+    oil, _, enters = inflow(np.column_stack([disc, np.full(len(disc), height)]), (0.0, 0.0, -speed), spacing, duration)
     sites = round(plate / spacing)
     ground = lattice((-sites * spacing / 2, -sites * spacing / 2, -LAYERS * spacing), (sites, sites, LAYERS), spacing)
     positions, wall = np.concatenate([oil, ground]), np.arange(len(oil) + len(ground)) >= len(oil)
@@ -206,7 +205,7 @@ def jet(
         physics=replace(physics, tension=tension or None, surface_tension=surface_tension or None),
         wall=wall,
         bounds=Tank((-plate / 2, -plate / 2, 0.0), (plate / 2, plate / 2, height)),
-        enters=np.concatenate([np.repeat(enters, len(disc)), np.zeros(len(ground))]).astype(np.float64),
+        enters=np.concatenate([enters, np.zeros(len(ground))]),
         guided=3 * spacing / speed,
     )
 

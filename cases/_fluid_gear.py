@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ._fluid import FluidScene, Solid, Tank, Turning, lattice
+from ._fluid import FluidScene, Solid, Tank, Turning, inflow, lattice
 from ._fluid_free import free
 from .meshes import gear
 
@@ -46,8 +46,8 @@ def jet_gear(
     vertices = vertices @ np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # its axis along -y
     disc = lattice((-diameter / 2,) * 2, (layers, layers), spacing)
     disc = disc[(disc**2).sum(axis=1) <= diameter**2 / 4] + (offset, 0.0)
-    enters = np.arange(int(duration * speed / spacing), dtype=np.float64) * spacing / speed
-    oil = np.tile(np.column_stack([disc, np.full(len(disc), tip + height)]), (len(enters), 1))
+    nozzle = np.column_stack([disc, np.full(len(disc), tip + height)])
+    oil, velocities, enters = inflow(nozzle, (0.0, 0.0, -speed), spacing, duration)
     sound_speed = 10 * math.hypot(speed, rate * tip)
     physics = replace(
         free(860.0, sound_speed, spacing),
@@ -57,14 +57,14 @@ def jet_gear(
     return FluidScene(
         name="jet-gear",
         positions=oil,
-        velocities=np.broadcast_to([0.0, 0.0, -speed], oil.shape).copy(),
+        velocities=velocities,
         masses=np.full(len(oil), 860.0 * spacing**3),
         spacing=spacing,
         duration=duration,
         step=0.25 * physics.smoothing / (1.2 * sound_speed),
         physics=physics,
         bounds=Tank((-around, -1.2 * width, -around), (around, 1.2 * width, tip + height)),
-        enters=np.repeat(enters, len(disc)),
+        enters=enters,
         guided=3 * spacing / speed,
         solid=Solid(vertices, named, Turning((0.0,) * 3, (0.0, 1.0, 0.0), rate) if rate else None),
     )

@@ -7,7 +7,7 @@
 from collections.abc import Callable
 from typing import TypeVar
 
-from ._fluid import WORDS, FluidScene, Gas, GasScene, Periodic, Physics, Scene, Solid, Tank, Turning
+from ._fluid import WORDS, FluidScene, Gas, GasScene, Periodic, Physics, Scene, Solid, Tank, Turning, inflow, lattice
 from ._fluid_flows import SCENES as _FLOWS
 from ._fluid_free import SCENES as _FREE
 from ._fluid_gas import SCENES as _GASES
@@ -16,7 +16,7 @@ from ._fluid_source import SCENES as _SOURCE
 
 __all__ = [
     "FLUIDS", "GASES", "WORDS", "FluidScene", "Gas", "GasScene", "Periodic", "Physics", "Scene", "Solid", "Tank", "Turning",
-    "fluid", "gas",
+    "fluid", "gas", "inflow", "lattice",
 ]  # fmt: skip
 
 _Make = TypeVar("_Make", bound=Callable[..., Scene])

@@ -3,7 +3,7 @@
 - `load_warp`: Warp as the library starts it, quietly and once, so that kernels of both share its settings.
 - `round_capacity`: how the library rounds the slots of a row, so that lists here are as long as those that it makes itself.
 - `triangle_query`: the kernels of a search for triangles one by one, with what they are given: a call of the library runs them all.
-- `taylor_green_velocity`, `lattice`, `free`, `LAYERS`: parts of scenes of `jfrnn.cases`, for answers and scenes beside them.
+- `taylor_green_velocity`, `free`, `LAYERS`: parts of scenes of `jfrnn.cases`, for answers and scenes beside them.
 """
 
 import ctypes
@@ -19,15 +19,10 @@ from jfrnn._geometry import make_cutoff
 from jfrnn._search import round_capacity
 from jfrnn._triangles import warp as _triangles_warp
 from jfrnn._triangles.cells import gather_corners
-from jfrnn.cases import _fluid, _fluid_flows, _fluid_free
+from jfrnn.cases import _fluid_flows, _fluid_free
 from jfrnn.kernels import _driver, triangles_cuda
 
-lattice, taylor_green_velocity, free, LAYERS = (
-    _fluid.lattice,
-    _fluid_flows.taylor_green_velocity,
-    _fluid_free.free,
-    _fluid_free.LAYERS,
-)
+taylor_green_velocity, free, LAYERS = _fluid_flows.taylor_green_velocity, _fluid_free.free, _fluid_free.LAYERS
 
 
 class TriangleQuery(NamedTuple):

@@ -10,10 +10,10 @@ import numpy as np
 from jax import Array
 from scipy.optimize import minimize
 
-from experiments._library import LAYERS, free, lattice
+from experiments._library import LAYERS, free
 from experiments.sph import answers
 from jfrnn.cases import fluids
-from jfrnn.cases.fluids import FluidScene
+from jfrnn.cases.fluids import FluidScene, lattice
 from jfrnn.sph import solver
 from jfrnn.sph.model import Model, State, make_model, make_state
 

@@ -5,12 +5,15 @@ A scene is plain data (`FluidScene`, `GasScene`). `make_model` and `make_state` 
 the same over many devices. On the command line: `python -m jfrnn.sph run SCENE`.
 """
 
-from jfrnn.cases.fluids import FluidScene, Gas, GasScene, Periodic, Physics, Scene, Solid, Tank, Turning
+from jfrnn.cases.fluids import FluidScene, Gas, GasScene, Periodic, Physics, Scene, Solid, Tank, Turning, inflow, lattice
+from jfrnn.sph.check import check_scene
 from jfrnn.sph.errors import DivergedError, SceneError
+from jfrnn.sph.files import read_solid, with_particles, with_solid
 from jfrnn.sph.model import make_model, make_state
 from jfrnn.sph.particles import Model, State
+from jfrnn.sph.probes import flow_through, force_on_solid, force_on_walls, pressure_at, surface_height
 from jfrnn.sph.runs import How, run
-from jfrnn.sph.settings import make_scene, with_particles, with_solid
+from jfrnn.sph.settings import make_scene
 from jfrnn.sph.solver import (
     advance,
     advance_until,
@@ -41,16 +44,25 @@ __all__ = [
     "advance",
     "advance_until",
     "begin",
+    "check_scene",
     "courant",
     "density_and_pressure",
     "energies",
+    "flow_through",
+    "force_on_solid",
+    "force_on_walls",
+    "inflow",
+    "lattice",
     "list_neighbors",
     "make_model",
     "make_scene",
     "make_state",
+    "pressure_at",
+    "read_solid",
     "rollout",
     "run",
     "step",
+    "surface_height",
     "with_particles",
     "with_solid",
 ]

@@ -4,12 +4,12 @@ import jax.numpy as jnp
 from jax import Array
 
 from jfrnn.sph import states
-from jfrnn.sph.particles import Flow, Model, State
+from jfrnn.sph.particles import Flow, Model, State, mass_there
 
 
 def kinetic_energy(model: Flow, s: State) -> Array:
     """Return ½ Σ m v² of the fluid [J; in 2D J/m], shape []."""
-    return jnp.sum(model.fluid_mass * jnp.sum(s.v * s.v, axis=1)) / 2
+    return jnp.sum(mass_there(model, s) * jnp.sum(s.v * s.v, axis=1)) / 2
 
 
 def potential_energy(model: Model, s: State) -> Array:
@@ -17,7 +17,7 @@ def potential_energy(model: Model, s: State) -> Array:
     if model.physics.gravity is None:
         return jnp.zeros((), s.x.dtype)
     ground = jnp.zeros((), s.x.dtype) if model.tank is None else model.tank[0]
-    return -jnp.sum(model.fluid_mass * jnp.sum((s.x - ground) * model.physics.gravity, axis=1))
+    return -jnp.sum(mass_there(model, s) * jnp.sum((s.x - ground) * model.physics.gravity, axis=1))
 
 
 def internal_energy(model: Model, s: State) -> Array:
@@ -35,9 +35,9 @@ def internal_energy(model: Model, s: State) -> Array:
         each = states.linear_energy(s.rho, physics.density, physics.sound_speed)
     else:
         each = states.tait_energy(s.rho, physics.density, physics.sound_speed, physics.exponent)
-    return jnp.sum(model.fluid_mass * each)
+    return jnp.sum(mass_there(model, s) * each)
 
 
 def momentum(model: Flow, s: State) -> Array:
     """Return Σ m v of the fluid [kg m/s], shape [d]."""
-    return jnp.sum(model.fluid_mass[:, None] * s.v, axis=0)
+    return jnp.sum(mass_there(model, s)[:, None] * s.v, axis=0)

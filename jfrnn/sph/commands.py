@@ -8,7 +8,7 @@ from typing import Any, NoReturn
 
 import jax
 
-from jfrnn.sph import listing, ranges, runs, settings
+from jfrnn.sph import files, listing, ranges, runs, settings
 from jfrnn.sph.errors import DivergedError, SceneError
 
 
@@ -101,8 +101,8 @@ def _run(given: argparse.Namespace) -> str:
         raise SceneError(f"--solid-unit {given.solid_unit:g}: is the unit of the file of --solid; name that file too")
     jax.config.update("jax_enable_x64", given.dtype == "float64")
     scene = settings.make_scene(given.scene, given.settings)
-    scene = scene if given.initial is None else settings.with_particles(scene, given.initial)
-    scene = scene if given.solid is None else settings.with_solid(scene, given.solid, given.solid_unit or 1.0)
+    scene = scene if given.initial is None else files.with_particles(scene, given.initial)
+    scene = scene if given.solid is None else files.with_solid(scene, given.solid, given.solid_unit or 1.0)
     folder = given.out or Path("out") / "sph" / given.scene
     runs.run(scene, folder, runs.How(given.frames, given.dtype, given.neighbors, given.skin, given.pictures))
     return str(folder)

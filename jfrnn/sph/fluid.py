@@ -11,21 +11,22 @@ from jax import Array
 import jfrnn
 from jfrnn.cases.fluids import FluidScene, Physics
 from jfrnn.sph import budget, forces, solids, walls
+from jfrnn.sph.errors import SceneError
 from jfrnn.sph.forces import density_and_pressure
 from jfrnn.sph.kernels import KERNELS
 from jfrnn.sph.pairs import Neighbors, reach
-from jfrnn.sph.particles import Model, State
+from jfrnn.sph.particles import Force, Model, State, active
 
 __all__ = ["begin", "beside", "courant", "density_and_pressure", "energies", "list_neighbors", "make_model", "make_state", "step"]
 
 beside = solids.begin
 
 
-def make_model(scene: FluidScene, dtype: type, backend: str) -> Model:
+def make_model(scene: FluidScene, dtype: type, backend: str, force: Force | None) -> Model:
     """Put what acts in a fluid into JAX, numbers of one dtype.
 
     Raises:
-        ValueError: A periodic box is too small for the kernel, or parts of the physics do not go together.
+        SceneError: A periodic box is too small for the kernel, or parts of the physics do not go together.
     """
 
     def array(value: Any) -> Array:  # noqa: ANN401
@@ -48,6 +49,8 @@ def make_model(scene: FluidScene, dtype: type, backend: str) -> Model:
         fluid_count=None if scene.wall is None else _first_wall(scene.wall),
         backend=backend,
         turning=solids.turning_of(scene, dtype),
+        outflow=scene.outflow and (array(scene.outflow.lower), array(scene.outflow.upper)),
+        force=force,
     )
 
 
@@ -58,7 +61,7 @@ def _check_box(scene: FluidScene) -> None:
     least = 2.05 * reach(KERNELS[scene.physics.kernel], scene.physics.smoothing)
     for axis, length, periodic in zip("xyz", scene.periodic.lengths, scene.periodic.axes, strict=False):
         if periodic and length < least:
-            raise ValueError(
+            raise SceneError(
                 f"periodic box must be 2.05 cutoffs wide along {axis}: {least:.6g} m, got {length:.6g} m: take more particles."
             )
 
@@ -67,16 +70,16 @@ def _check_parts(scene: FluidScene) -> None:
     """Refuse what does not compile, or compiles and means nothing."""
     physics = scene.physics
     if physics.integrator == "leapfrog" and physics.evolve != "summation":
-        raise ValueError(
+        raise SceneError(
             f"integrator 'leapfrog' carries no density or pressure, got evolve {physics.evolve!r}: "
             "take evolve 'summation', or integrator 'symplectic' or 'midpoint'."
         )
     if scene.tank is not None and physics.restitution is None:
-        raise ValueError("restitution must be a number from 0 to 1 in a tank, got None: take 1 for walls that take no speed away.")
+        raise SceneError("restitution must be a number from 0 to 1 in a tank, got None: take 1 for walls that take no speed away.")
     if scene.solid is not None:
         _check_solid(physics)
     if physics.pressure == "difference" and scene.periodic is None and scene.wall is None:
-        raise ValueError(
+        raise SceneError(
             "pressure 'difference' does not vanish at a free surface, got a scene without walls or period: "
             "take 'mean', 'symmetric' or 'volume'."
         )
@@ -90,24 +93,26 @@ def _check_solid(physics: Physics[float, tuple[float, ...]]) -> None:
         ("pressure", ("mean", "symmetric", "volume")),
     ):
         if getattr(physics, name) not in allowed:
-            raise ValueError(f"{name} must be {' or '.join(map(repr, allowed))} beside a solid, got {getattr(physics, name)!r}.")
+            raise SceneError(f"{name} must be {' or '.join(map(repr, allowed))} beside a solid, got {getattr(physics, name)!r}.")
     for name in ("transport", "shifting", "surface_tension"):
         if getattr(physics, name) is not None:
-            raise ValueError(f"{name} must be None beside a solid, whose surface it does not know, got {getattr(physics, name)}.")
+            raise SceneError(f"{name} must be None beside a solid, whose surface it does not know, got {getattr(physics, name)}.")
     if physics.corrected:
-        raise ValueError("corrected must be False beside a solid: what it corrects is what the wall lacks in particles.")
+        raise SceneError("corrected must be False beside a solid: what it corrects is what the wall lacks in particles.")
 
 
 def make_state(scene: FluidScene, dtype: type) -> State:
     """Put the particles of a fluid into JAX, where they are at first.
 
     Raises:
-        ValueError: The solid is not closed, or holds a particle.
+        SceneError: The solid is not closed, or holds a particle.
     """
     physics = scene.physics
     x, v = jnp.asarray(scene.positions, dtype), jnp.asarray(scene.velocities, dtype)
     zero = jnp.zeros((), dtype)
     state = State(x, v, zero, jnp.zeros_like(x), zero, solid=solids.begin(scene, x))
+    if scene.outflow is not None:
+        state = state._replace(gone=jnp.zeros(scene.n, bool))
     if physics.transport is not None or physics.shifting is not None:
         state = state._replace(w=jnp.zeros_like(x))
     if physics.evolve == "continuity":
@@ -158,7 +163,7 @@ def _greatest(vectors: Array) -> Array:
 
 def list_neighbors(model: Model, s: State, skin: float, slack: float) -> jfrnn.NeighborList:
     """Return a neighbor list with a skin [m], and slots for `slack` times the longest row."""
-    return jfrnn.search(s.x, model.cutoff, box=model.box, active=forces.active(model, s.time), skin=skin, slack=slack)
+    return jfrnn.search(s.x, model.cutoff, box=model.box, active=active(model, s), skin=skin, slack=slack)
 
 
 def energies(model: Model, s: State) -> dict[str, Array]:
@@ -168,11 +173,23 @@ def energies(model: Model, s: State) -> dict[str, Array]:
 
 def step(model: Model, s: State, dt: Array, nbrs: Neighbors) -> tuple[State, Neighbors]:
     """Advance by a time step [s] as the physics says; the list, where there is one, is updated."""
-    return _INTEGRATORS[model.physics.integrator](model, s, dt, nbrs)
+    s, nbrs = _INTEGRATORS[model.physics.integrator](model, s, dt, nbrs)
+    return (s if s.gone is None or model.outflow is None else _let_go(model, s, s.gone, *model.outflow)), nbrs
+
+
+def _let_go(model: Model, s: State, gone: Array, lower: Array, upper: Array) -> State:
+    """Return the state without the particles of the fluid that are outside of the corners [m]; they rest where they left."""
+    outside = jnp.any((s.x < lower) | (s.x > upper), axis=1)
+    if model.wall is not None:
+        outside = outside & ~model.wall
+    if model.enters is not None:
+        outside = outside & (s.time >= model.enters)
+    gone = gone | outside
+    return s._replace(gone=gone, v=jnp.where(gone[:, None], 0, s.v), a=jnp.where(gone[:, None], 0, s.a))
 
 
 def _update(model: Model, s: State, nbrs: Neighbors) -> Neighbors:
-    return None if nbrs is None else nbrs.update(s.x, active=forces.active(model, s.time))
+    return None if nbrs is None else nbrs.update(s.x, active=active(model, s))
 
 
 def _evaluate(model: Model, s: State, nbrs: Neighbors, dt: Array | None = None) -> State:
@@ -205,7 +222,7 @@ def _besides(model: Model, sums: Array | None, dt: Array) -> Array | None:
 
 def _transport_velocity(model: Model, s: State) -> Array:
     """Return the velocities with which positions change; dummies of walls stay, their velocity is along the wall."""
-    return walls.keep_fluid(forces.are_resting(model, s.time), s.v if s.w is None else s.v + s.w)
+    return walls.keep_fluid(forces.are_resting(model, s), s.v if s.w is None else s.v + s.w)
 
 
 def _bounce(model: Model, s: State) -> State:
@@ -232,7 +249,7 @@ def _symplectic(model: Model, s: State, dt: Array, nbrs: Neighbors) -> tuple[Sta
     """
     s = s._replace(v=s.v + dt / 2 * s.a)
     moved = s.x + dt * _transport_velocity(model, s)
-    s = s._replace(x=moved) if s.solid is None else solids.keep_out(model, s, moved, s.v, dt, forces.are_resting(model, s.time))
+    s = s._replace(x=moved) if s.solid is None else solids.keep_out(model, s, moved, s.v, dt, forces.are_resting(model, s))
     s = _bounce(model, s)
     nbrs = _update(model, s, nbrs)
     s = _evaluate(model, s, nbrs, dt)

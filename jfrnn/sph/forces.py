@@ -9,7 +9,7 @@ from jax import Array
 from jfrnn.sph import correction, density, solids, states, surface, transport, viscosity, walls
 from jfrnn.sph.kernels import KERNELS
 from jfrnn.sph.pairs import Neighbors, Pair, Term, Values, total
-from jfrnn.sph.particles import Flow, Model, State
+from jfrnn.sph.particles import Model, State, active, own_acceleration
 from jfrnn.sph.pressure import PRESSURES
 
 
@@ -22,21 +22,18 @@ class Fields(NamedTuple):
     inverse: Array | None
 
 
-def active(model: Flow, time: Array) -> Array | None:
-    """Return which particles have entered, shape [n], bool; None where all are there from the beginning."""
-    return None if model.enters is None else time >= model.enters
+def are_resting(model: Model, s: State) -> Array | None:
+    """Return which particles stay where they are, shape [n], bool: those of walls, and those that take no part."""
+    there = active(model, s)
+    return model.wall if there is None else _either(model.wall, ~there)
 
 
-def are_resting(model: Model, time: Array) -> Array | None:
-    """Return which particles stay where they are, shape [n], bool: those of walls, and those that have not entered yet."""
-    return model.wall if model.enters is None else _either(model.wall, time < model.enters)
-
-
-def are_guided(model: Model, time: Array) -> Array | None:
-    """Return which particles keep their velocity, shape [n], bool: those of walls, and those that have just entered."""
-    if model.enters is None or model.guided is None:
-        return model.wall
-    return _either(model.wall, time < model.enters + model.guided)
+def are_guided(model: Model, s: State) -> Array | None:
+    """Return which particles keep their velocity, shape [n], bool: those of walls, that have just entered, or that have left."""
+    guided = model.wall
+    if model.enters is not None and model.guided is not None:
+        guided = _either(guided, s.time < model.enters + model.guided)
+    return guided if s.gone is None else _either(guided, s.gone)
 
 
 def _either(mask: Array | None, other: Array) -> Array:
@@ -53,7 +50,7 @@ def _sum(term: Term, model: Model, s: State, values: Values, nbrs: Neighbors, of
     if "rho" in values:  # per particle: a division per pair takes as long as the rest of a term
         values = values | {"specific": 1 / values["rho"], "volume": model.m / values["rho"]}
     values = values | {"m": model.m} | ({} if model.wall is None else {"wall": model.wall})
-    entered, k = active(model, s.time), model.fluid_count
+    entered, k = active(model, s), model.fluid_count
     if k is None or nbrs is not None or of == "all":
         return total(term, s.x, values, model.kernel, model.physics.smoothing, nbrs, active=entered, **options)
     rows, sources = (slice(0, k), slice(None)) if of == "fluid" else (slice(k, None), slice(0, k))
@@ -197,13 +194,16 @@ def accelerations(model: Model, s: State, seen: Fields, nbrs: Neighbors) -> tupl
 
     sums = _sum(term, model, s, values, nbrs, "fluid")
     a = sums["a"] if physics.gravity is None else sums["a"] + physics.gravity
+    own = own_acceleration(model, s)
+    if own is not None:
+        a = a + own
     if s.solid is not None:
         a = a + solids.push(model, s, s.solid, seen.rho, seen.p)
     if physics.surface_tension is not None:
         a = a + _tension(model, s, seen.rho, nbrs, physics.surface_tension)
     if physics.damping is not None:
         a = a - _damping(physics.damping, physics.damped_until, s.time) * s.v
-    return walls.keep_fluid(are_guided(model, s.time), a), sums.get("w")
+    return walls.keep_fluid(are_guided(model, s), a), sums.get("w")
 
 
 def _tension(model: Model, s: State, rho: Array, nbrs: Neighbors, tension: Array) -> Array:

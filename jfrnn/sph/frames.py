@@ -15,11 +15,12 @@ from jfrnn.sph import view
 WALL = "0.75"
 
 
-def draw(scene: Scene, x: np.ndarray, v: np.ndarray, time: float, top_speed: float, path: Path) -> None:
+def draw(scene: Scene, there: np.ndarray, x: np.ndarray, v: np.ndarray, time: float, top_speed: float, path: Path) -> None:
     """Draw particles from the side, colored by speed: the first axis to the right, the last one upwards; a solid in 3D aslant.
 
     Args:
         scene: The scene; its bounds are the frame.
+        there: Which particles take part, shape [n], bool.
         x: Positions [m], shape [n, d].
         v: Velocities [m/s], shape [n, d].
         time: [s].
@@ -27,14 +28,13 @@ def draw(scene: Scene, x: np.ndarray, v: np.ndarray, time: float, top_speed: flo
         path: The picture.
     """
     if scene.solid is not None and scene.dim == 3:
-        _draw_in_space(scene, x, v, time, top_speed, path)
+        _draw_in_space(scene, x[there], v[there], time, top_speed, path)
         return
     lower, upper = picture_bounds(scene)
     wide, high = (upper - lower)[[0, -1]]
     figure = Figure(figsize=(7.0, min(max(7.0 * high / wide, 2.5) + 0.8, 9.0)), layout="constrained")
     axes = figure.add_subplot()
     x = wrap_positions(scene, x)
-    there = np.ones(scene.n, bool) if scene.enters is None else scene.enters <= time
     wall = np.zeros(scene.n, bool) if scene.wall is None else scene.wall
     depth = np.argsort(x[:, 1]) if scene.dim == 3 else np.arange(scene.n)
     seen = depth[(there & ~wall)[depth]]
@@ -56,9 +56,8 @@ def draw(scene: Scene, x: np.ndarray, v: np.ndarray, time: float, top_speed: flo
 
 def _draw_in_space(scene: Scene, x: np.ndarray, v: np.ndarray, time: float, top_speed: float, path: Path) -> None:
     """Draw particles that have come, and the solid, aslant from above."""
-    there = np.ones(scene.n, bool) if scene.enters is None else scene.enters <= time
     scale = ScalarMappable(Normalize(0, top_speed or 1.0), "viridis")
-    picture = view.render(scene, x[there], scale.to_rgba(np.linalg.norm(v[there], axis=1))[:, :3], time)
+    picture = view.render(scene, x, scale.to_rgba(np.linalg.norm(v, axis=1))[:, :3], time)
     figure = Figure(figsize=(7.0, 6.0), layout="constrained")
     axes = figure.add_subplot()
     axes.imshow(picture)

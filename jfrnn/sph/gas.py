@@ -13,15 +13,16 @@ from jax import Array
 
 from jfrnn.cases.fluids import GasScene
 from jfrnn.sph import budget
+from jfrnn.sph.errors import SceneError
 from jfrnn.sph.pairs import Neighbors, Pair, Values, total_of_own
-from jfrnn.sph.particles import GasModel, State, Thermal
+from jfrnn.sph.particles import Force, GasModel, State, Thermal, own_acceleration
 
 COURANT = 0.3
 PASSES = 1  # of Newton's method in each step: the lengths of the step before, grown with the flow, are off by the square of a step
 FIRST_PASSES = 25  # at first, when nothing is known
 _FARTHEST = 0.3  # a pass changes the logarithm of a length by no more than this
 _LEAST_OMEGA = 0.1  # particles that are alone have 0: their density says nothing about their length
-_NOT_THERE = ("wall", "periodic", "tank", "sealed", "enters", "densities", "pressures", "solid")
+_NOT_THERE = ("wall", "periodic", "tank", "sealed", "enters", "outflow", "densities", "pressures", "solid")
 _PENETRATION = 3.0  # how much the velocities by which two particles approach each other add to the signal between them
 
 
@@ -32,21 +33,21 @@ class Density(NamedTuple):
     omega: Array
 
 
-def make_model(scene: GasScene, dtype: type, backend: str) -> GasModel:
+def make_model(scene: GasScene, dtype: type, backend: str, force: Force | None) -> GasModel:
     """Put what acts in a gas into JAX, numbers of one dtype.
 
     Raises:
-        ValueError: The scene has what a gas here has not: walls, a box, particles that enter.
+        SceneError: The scene has what a gas here has not: walls, a box, particles that enter.
     """
     for name in _NOT_THERE:
         if getattr(scene, name) is not None:
-            raise ValueError(f"{name} must be None in a scene of a gas, which is in open space, got {getattr(scene, name)!r}.")
+            raise SceneError(f"{name} must be None in a scene of a gas, which is in open space, got {getattr(scene, name)!r}.")
 
     def array(value: Any) -> Array:  # noqa: ANN401
         return jnp.asarray(value, dtype)
 
     step = None if scene.step is None else array(scene.step)
-    return GasModel(jax.tree.map(array, scene.physics), array(scene.masses), step, scene.dim, backend)
+    return GasModel(jax.tree.map(array, scene.physics), array(scene.masses), step, scene.dim, backend, force)
 
 
 def make_state(scene: GasScene, dtype: type) -> State:
@@ -177,7 +178,8 @@ def _evaluate(model: GasModel, s: State, u: Array, h: Array) -> State:
     sums = total_of_own(term, s.x, values, model.kernel, h, "either", model.backend)
     heating = push * sums["opening"] + sums.get("heat", 0)
     growth = -sums["opening"] / (omega * rho * model.dim)
-    return s._replace(a=sums["a"], gas=Thermal(u, h, heating, growth))
+    own = own_acceleration(model, s)
+    return s._replace(a=sums["a"] if own is None else sums["a"] + own, gas=Thermal(u, h, heating, growth))
 
 
 def _viscosity(pair: Pair, towards: Array, i: Values, j: Values) -> Array:

@@ -24,6 +24,8 @@ def complaint(scene: Scene, s: State) -> str | None:
     outside = ((x < np.array(scene.sealed.lower) - far) | (x > np.array(scene.sealed.upper) + far)).any(axis=1)
     if scene.wall is not None:
         outside &= ~scene.wall
+    if s.gone is not None:
+        outside &= ~np.asarray(s.gone)
     if not outside.any():
         return None
     particle = int(outside.argmax())

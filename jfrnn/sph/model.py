@@ -2,14 +2,17 @@
 
 from typing import Any, Protocol, overload
 
+import jax
 import numpy as np
 from jax import Array
 
 import jfrnn
 from jfrnn.cases.fluids import FluidScene, GasScene, Scene
 from jfrnn.sph import fluid, gas
+from jfrnn.sph.check import check_scene
+from jfrnn.sph.errors import SceneError
 from jfrnn.sph.pairs import Neighbors
-from jfrnn.sph.particles import Beside, Flow, GasModel, Model, State
+from jfrnn.sph.particles import Beside, Flow, Force, GasModel, Model, State
 
 __all__ = ["Kind", "Model", "State", "kind_of", "make_model", "make_state"]
 
@@ -17,7 +20,7 @@ __all__ = ["Kind", "Model", "State", "kind_of", "make_model", "make_state"]
 class Kind(Protocol):
     """What a kind of flow does with its scenes, models and states; the modules `fluid` and `gas` are the two that there are."""
 
-    def make_model(self, scene: Any, dtype: type, backend: str) -> Any:  # noqa: ANN401
+    def make_model(self, scene: Any, dtype: type, backend: str, force: Force | None) -> Any:  # noqa: ANN401
         """Put what acts in a scene into JAX."""
         ...
 
@@ -54,32 +57,58 @@ class Kind(Protocol):
         ...
 
 
+def choose_dtype(dtype: Any) -> type:  # noqa: ANN401
+    """Return a dtype of floats that JAX has now, where none is given the widest.
+
+    Raises:
+        SceneError: It is none, or float64 where JAX has it not.
+    """
+    widest = np.float64 if jax.config.read("jax_enable_x64") else np.float32
+    asked = np.dtype(widest if dtype is None else dtype)
+    if asked not in (np.float32, np.float64):
+        raise SceneError(f"dtype must be float32 or float64, got {asked}.")
+    if asked == np.float64 and widest == np.float32:
+        raise SceneError('dtype float64 needs jax.config.update("jax_enable_x64", True) before; or take float32.')
+    return asked.type
+
+
 def kind_of(flow: Scene | Flow) -> Kind:
     """Return the kind of a scene or of a model."""
     return gas if isinstance(flow, GasScene | GasModel) else fluid
 
 
 @overload
-def make_model(scene: FluidScene, dtype: type = ..., backend: str = ...) -> Model: ...
+def make_model(scene: FluidScene, dtype: type | None = ..., backend: str = ..., *, force: Force | None = ...) -> Model: ...
 
 
 @overload
-def make_model(scene: Scene, dtype: type = ..., backend: str = ...) -> Flow: ...
+def make_model(scene: Scene, dtype: type | None = ..., backend: str = ..., *, force: Force | None = ...) -> Flow: ...
 
 
-def make_model(scene: Scene, dtype: type = np.float64, backend: str = "auto") -> Flow:
+def make_model(scene: Scene, dtype: type | None = None, backend: str = "auto", *, force: Force | None = None) -> Flow:
     """Put what acts in a scene into JAX, numbers of one dtype.
 
+    Args:
+        scene: The scene.
+        dtype: float32 or float64; None: float64 where JAX has it, as `jax_enable_x64` says.
+        backend: Of `jfrnn.pair_sum`.
+        force: A function of a `State` that returns accelerations [m/s²], shape [n, d], which act besides those of the physics;
+            inside jit. Numbers in it that are to be traced are arguments of a `jax.tree_util.Partial`.
+
     Raises:
-        ValueError: A periodic box is too small for the kernel, or parts of the physics do not go together; or as `gas.make_model`.
+        SceneError: As `check_scene`; or a periodic box is too small for the kernel, or parts of the physics do not go together.
     """
-    return kind_of(scene).make_model(scene, dtype, backend)
+    check_scene(scene)
+    if force is not None and not isinstance(force, jax.tree_util.Partial):
+        force = jax.tree_util.Partial(force)
+    return kind_of(scene).make_model(scene, choose_dtype(dtype), backend, force)
 
 
-def make_state(scene: Scene, dtype: type = np.float64) -> State:
+def make_state(scene: Scene, dtype: type | None = None) -> State:
     """Put the particles of a scene into JAX, where they are at first; `solver.begin` does the rest.
 
     Raises:
-        ValueError: The solid is not closed, or holds a particle.
+        SceneError: As `check_scene`; or the solid is not closed, or holds a particle.
     """
-    return kind_of(scene).make_state(scene, dtype)
+    check_scene(scene)
+    return kind_of(scene).make_state(scene, choose_dtype(dtype))

@@ -1,5 +1,6 @@
 """What a scene is made of once it is in JAX: a model, which stays, and a state, which moves. Both are pytrees."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, fields
 from typing import ClassVar, NamedTuple
 
@@ -10,9 +11,11 @@ from jax import Array
 import jfrnn
 from jfrnn.cases import fluids
 from jfrnn.cases.fluids import Gas, Physics, Turning
+from jfrnn.sph.errors import SceneError
 from jfrnn.sph.kernels import KERNELS, Kernel
 from jfrnn.sph.pairs import reach
 
+Force = Callable[["State"], Array]
 jax.tree_util.register_dataclass(
     fluids.Physics,
     data_fields=[item.name for item in fields(fluids.Physics) if item.name not in fluids.WORDS],
@@ -40,6 +43,9 @@ class Model:
         fluid_count: How many particles stand before those of walls; None where there are no walls, or among the fluid. Static.
         backend: Of `jfrnn.pair_sum`. Static.
         turning: How the wall of triangles turns; None: it stays, or there is none.
+        outflow: Lower and upper corner [m] of what particles leave for good, shape [d] each.
+        force: A function of the state that returns accelerations [m/s²], shape [n, d], besides those of the physics; a
+            `jax.tree_util.Partial`, whose arguments may be traced.
     """
 
     physics: Physics[Array, Array]
@@ -54,6 +60,8 @@ class Model:
     fluid_count: int | None = field(metadata={"static": True})
     backend: str = field(default="auto", metadata={"static": True})
     turning: Turning[Array, Array] | None = None
+    outflow: tuple[Array, Array] | None = None
+    force: Force | None = None
 
     @property
     def kernel(self) -> Kernel:
@@ -82,6 +90,7 @@ class GasModel:
         step: Time step [s]; None: the Courant condition gives it.
         dim: Number of axes. Static.
         backend: Of `jfrnn.pair_sum`. Static.
+        force: As in `Model`.
     """
 
     physics: Gas[Array]
@@ -89,6 +98,7 @@ class GasModel:
     step: Array | None
     dim: int = field(metadata={"static": True})
     backend: str = field(default="auto", metadata={"static": True})
+    force: Force | None = None
     enters: ClassVar[None] = None  # all are there, and there is no wall
     turning: ClassVar[None] = None
 
@@ -151,6 +161,7 @@ class State(NamedTuple):
         w: Velocities with which particles move besides v [m/s], shape [n, d].
         solid: The wall of triangles as particles see it.
         gas: What else moves in a gas.
+        gone: Which particles have left by the outflow, shape [n], bool.
     """
 
     x: Array
@@ -163,6 +174,35 @@ class State(NamedTuple):
     w: Array | None = None
     solid: Beside | None = None
     gas: Thermal | None = None
+    gone: Array | None = None
 
 
 Flow = Model | GasModel
+
+
+def active(model: Flow, s: State) -> Array | None:
+    """Return which particles take part, shape [n], bool: those that have entered and not left; None where all do."""
+    entered = None if model.enters is None else s.time >= model.enters
+    if s.gone is None:
+        return entered
+    return ~s.gone if entered is None else entered & ~s.gone
+
+
+def mass_there(model: Flow, s: State) -> Array:
+    """Return masses of the fluid [kg], shape [n]: 0 of dummies of walls, and of particles that take no part."""
+    there = active(model, s)
+    return model.fluid_mass if there is None else jnp.where(there, model.fluid_mass, 0)
+
+
+def own_acceleration(model: Flow, s: State) -> Array | None:
+    """Return what the own force of a model says [m/s²], shape [n, d]; None where it has none.
+
+    Raises:
+        SceneError: It has another shape.
+    """
+    if model.force is None:
+        return None
+    a = jnp.asarray(model.force(s))
+    if a.shape != s.x.shape:
+        raise SceneError(f"force must return accelerations [m/s²] of shape {list(s.x.shape)}, got {list(a.shape)}.")
+    return a.astype(s.x.dtype)

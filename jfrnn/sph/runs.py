@@ -1,9 +1,11 @@
 """Run a scene: in chunks of steps, a snapshot, a line of energies and a picture after each, from the last snapshot on."""
 
 import hashlib
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
+from typing import Any
 
 import jax
 import numpy as np
@@ -11,11 +13,13 @@ from jax import Array
 
 import jfrnn
 from jfrnn.cases.fluids import GasScene, Scene
-from jfrnn.sph import forces, health, settings, snapshots, solids, solver
+from jfrnn.sph import health, settings, snapshots, solids, solver
 from jfrnn.sph.errors import SceneError
-from jfrnn.sph.model import make_model, make_state
+from jfrnn.sph.interrupts import hold_interrupts
+from jfrnn.sph.model import choose_dtype, make_model, make_state
 from jfrnn.sph.pairs import Neighbors
-from jfrnn.sph.particles import Flow, State
+from jfrnn.sph.particles import Flow, Force, State, active
+from jfrnn.sph.probes import Probe, columns
 from jfrnn.sph.progress import Progress
 
 
@@ -25,20 +29,22 @@ class How:
 
     Attributes:
         frames: Snapshots after the first.
-        dtype: "float32" or "float64".
+        dtype: "float32" or "float64"; None: float64 where JAX has it, as `jax_enable_x64` says.
         neighbors: "pair_sum": every sum finds neighbors anew; "list": a list with a skin is updated; "auto": what is faster here.
         skin: Of the list, in particle spacings.
         pictures: Whether frames and a GIF are drawn.
+        lines: Lines of the tables, energies.csv and probes.csv, for each snapshot.
     """
 
     frames: int = 50
-    dtype: str = "float64"
+    dtype: str | None = None
     neighbors: str = "auto"
     skin: float = 0.3
     pictures: bool = True
+    lines: int = 1
 
 
-MOST_STEPS = 2000  # between two looks at a run
+SECONDS, MOST_STEPS = 0.5, 100_000  # between two looks at a run
 MOST_FOR_LISTS = 1 << 18  # particles up to which sums over a list are faster on a GPU; see `faster_way`
 
 
@@ -51,13 +57,25 @@ def faster_way(platform: str, particles: int) -> str:
     return "list" if platform != "cpu" and particles <= MOST_FOR_LISTS else "pair_sum"
 
 
-def run(scene: Scene, folder: Path, how: How) -> State:
+def run(
+    scene: Scene,
+    folder: Path | str,
+    how: How = How(),
+    *,
+    force: Force | None = None,
+    probes: dict[str, Probe] | None = None,
+) -> State:
     """Run a scene from its beginning, or from the last snapshot of the folder, to its end.
+
+    Ctrl-C stops it between two steps; the same call then goes on from the last snapshot, to the same end. A run that has ended goes
+    on if the scene takes longer, and has as many snapshots more.
 
     Args:
         scene: The scene.
-        folder: Gets run.json, energies.csv, snapshots/STEP.npz and .vtp, frames/STEP.png, NAME.gif.
+        folder: Gets run.json, energies.csv, probes.csv, snapshots/STEP.npz and .vtp, frames/STEP.png, NAME.gif.
         how: Options.
+        force: As in `make_model`. It is no part of run.json: who goes on with a run gives the same.
+        probes: Functions (model, state) -> numbers, arrays or dicts of them, inside jit, whose values are columns of probes.csv.
 
     Returns:
         The last state.
@@ -65,41 +83,72 @@ def run(scene: Scene, folder: Path, how: How) -> State:
     Raises:
         SceneError: The folder holds another run, or the scene cannot be run.
         DivergedError: A particle is not finite, or went through a wall.
+        KeyboardInterrupt: Ctrl-C came.
     """
-    about = settings.describe(scene) | {"dtype": how.dtype, "frames": how.frames, "given": _digest(scene)}
-    dtype = np.dtype(how.dtype).type
-    try:
-        model, first = make_model(scene, dtype), make_state(scene, dtype)  # what is refused leaves no folder
-    except ValueError as error:
-        raise SceneError(f"scene {scene.name!r}: {error}") from error
-    snapshots.check_same(about, folder)
-    saved = snapshots.latest(folder / "snapshots", scene)
-    s, step = saved or (first, 0)
-    nbrs = _first_neighbors(scene, model, s, how)
-    if saved is None:
-        s = jax.jit(solver.begin)(model, s, nbrs)
-        _keep(scene, model, s, nbrs, folder, step, how)
-    progress = Progress(how.frames, round(how.frames * float(s.time) / scene.duration))
-    while (goal := _next_moment(scene, s, how.frames)) is not None:
-        start, before_it = perf_counter(), step
-        while float(s.time) < goal:
-            before, nbrs_before = s, nbrs
-            s, nbrs, steps = _chunk(model, s, nbrs, goal)
-            jax.block_until_ready(s.x)
-            health.check(scene, model, before, nbrs_before, s, steps, step)
-            if isinstance(nbrs, jfrnn.NeighborList):
-                nbrs.check()
-            step += steps
-        seconds = perf_counter() - start
-        line = _keep(scene, model, s, nbrs, folder, step, how)
-        text = f"{scene.name}: t {line['time']:.4g} s, {(step - before_it) / seconds:.0f} steps/s, energy {line['total']:.4g} J"
-        progress.advance(text + ("" if nbrs is None else f", {int(nbrs.rebuild_count)} rebuilds"))
-    progress.end()
-    if how.pictures:
-        from jfrnn.sph import frames
+    folder, dtype = Path(folder), choose_dtype(how.dtype)
+    with hold_interrupts() as stopped:
+        try:
+            model, first = make_model(scene, dtype, force=force), make_state(scene, dtype)  # what is refused leaves no folder
+        except SceneError as error:
+            raise SceneError(f"scene {scene.name!r}: {error}") from error
+        snapshots.check_same(_describe(scene, how, dtype), folder)
+        saved = snapshots.latest(folder / "snapshots", scene)
+        s, step = saved or (first, 0)
+        nbrs = _first_neighbors(scene, model, s, how)
+        write = _Writer(scene, model, folder, how, probes or {})
+        if saved is None:
+            s = jax.jit(solver.begin)(model, s, nbrs)
+            write.line(s, step)
+            write.snapshot(s, nbrs, step)
+        moments = how.frames * how.lines
+        progress = Progress(how.frames, round(how.frames * float(s.time) / scene.duration))
+        start, step_before = perf_counter(), step
+        while (moment := round(moments * float(s.time) / scene.duration) + 1) <= moments:
+            goal = float(np.asarray(scene.duration * moment / moments, s.x.dtype))  # as the dtype rounds it
+            s, nbrs, step = _go_to(goal, scene, model, s, nbrs, step, stopped)
+            line = write.line(s, step)
+            if moment % how.lines:
+                continue
+            write.snapshot(s, nbrs, step)
+            rate = f"{(step - step_before) / (perf_counter() - start):.0f} steps/s"
+            start, step_before = perf_counter(), step
+            text = f"{scene.name}: t {line['time']:.4g} s, {rate}, energy {line['total']:.4g} J"
+            progress.advance(text + ("" if nbrs is None else f", {int(nbrs.rebuild_count)} rebuilds"))
+        progress.end()
+        if how.pictures:
+            from jfrnn.sph import frames
 
-        frames.animate(folder / "frames", folder / f"{scene.name}.gif")
+            frames.animate(folder / "frames", folder / f"{scene.name}.gif")
     return s
+
+
+def _go_to(
+    goal: float, scene: Scene, model: Flow, s: State, nbrs: Neighbors, step: int, stopped: Callable[[], bool]
+) -> tuple[State, Neighbors, int]:
+    """Run steps to a time [s], looking after about half a second whether all is well, and whether the user stops it."""
+    most = 1
+    while float(s.time) < goal:
+        if stopped():
+            raise KeyboardInterrupt
+        start, before, nbrs_before = perf_counter(), s, nbrs
+        s, nbrs, steps = _chunk(model, s, nbrs, goal, most)
+        jax.block_until_ready(s.x)
+        most = max(1, min(round(SECONDS * steps / (perf_counter() - start)), MOST_STEPS))
+        health.check(scene, model, before, nbrs_before, s, steps, step)
+        if isinstance(nbrs, jfrnn.NeighborList):
+            nbrs.check()
+        step += steps
+    return s, nbrs, step
+
+
+def _describe(scene: Scene, how: How, dtype: type) -> dict[str, Any]:
+    """Return what a run must have in common with one that it goes on with."""
+    return settings.describe(scene) | {
+        "dtype": np.dtype(dtype).name,
+        "frames": how.frames,
+        "lines": how.lines,
+        "given": _digest(scene),
+    }
 
 
 def _first_neighbors(scene: Scene, model: Flow, s: State, how: How) -> Neighbors:
@@ -123,48 +172,59 @@ def _digest(scene: Scene) -> str:
     return hashlib.sha256(b"".join(np.ascontiguousarray(a).tobytes() for a in arrays)).hexdigest()[:12]
 
 
-def _chunk(model: Flow, s: State, nbrs: Neighbors, goal: float) -> tuple[State, Neighbors, int]:
-    """Run steps to a time [s], at most `MOST_STEPS`, and return their number; where a row of a list overflowed, all again."""
+def _chunk(model: Flow, s: State, nbrs: Neighbors, goal: float, most: int) -> tuple[State, Neighbors, int]:
+    """Run steps to a time [s], at most so many, and return their number; where a row of a list overflowed, all again."""
     while True:
-        after, seen, steps = _chunk_of_particles(model, s, nbrs, goal)
+        after, seen, steps = _chunk_of_particles(model, s, nbrs, goal, most)
         if s.solid is None or after.solid is None or not after.solid.tri.overflow:
             return after, seen, int(steps)
         larger = after.solid.tri.grow(solids.into_frame(s.x, model.turning, s.solid.angle))
         s = s._replace(solid=s.solid._replace(tri=larger))
 
 
-def _chunk_of_particles(model: Flow, s: State, nbrs: Neighbors, goal: float) -> tuple[State, Neighbors, Array | int]:
+def _chunk_of_particles(model: Flow, s: State, nbrs: Neighbors, goal: float, most: int) -> tuple[State, Neighbors, Array | int]:
     if nbrs is None:
-        return solver.advance_until(model, s, None, goal, MOST_STEPS)
-    active = None if model.enters is None else lambda carry: forces.active(model, carry[0].time)
+        return solver.advance_until(model, s, None, goal, most)
+    there = None if active(model, s) is None else lambda carry: active(model, carry[0])
 
     def advance(carry: tuple[State, Array | int], nbrs: Neighbors) -> tuple[tuple[State, Array | int], Neighbors]:
-        after, nbrs, steps = solver.advance_until(model, carry[0], nbrs, goal, MOST_STEPS)
+        after, nbrs, steps = solver.advance_until(model, carry[0], nbrs, goal, most)
         return (after, steps), nbrs
 
     try:
-        (after, steps), nbrs = jfrnn.run_chunk(advance, (s, 0), nbrs, lambda carry: carry[0].x, active=active)  # type: ignore[arg-type]
+        (after, steps), nbrs = jfrnn.run_chunk(advance, (s, 0), nbrs, lambda carry: carry[0].x, active=there)  # type: ignore[arg-type]
     except ValueError:  # particles are nowhere: `health.check` finds out since which step
         (after, steps), nbrs = advance((s, 0), nbrs)
     return after, nbrs, steps
 
 
-def _next_moment(scene: Scene, s: State, count: int) -> float | None:
-    """Return the time of the next snapshot [s]; None at the end. Steps end exactly at these times, as the dtype rounds them."""
-    done = round(float(s.time) * count / scene.duration)
-    return float(np.asarray(scene.duration * (done + 1) / count, s.x.dtype)) if done < count else None
+class _Writer:
+    """Writes what belongs to a moment of a run."""
 
+    def __init__(self, scene: Scene, model: Flow, folder: Path, how: How, probes: dict[str, Probe]) -> None:
+        self._scene, self._model, self._folder, self._how = scene, model, folder, how
+        self._probe = jax.jit(lambda model, s: {name: probe(model, s) for name, probe in probes.items()}) if probes else None
+        self._line: dict[str, float] = {}
 
-def _keep(scene: Scene, model: Flow, s: State, nbrs: Neighbors, folder: Path, step: int, how: How) -> dict[str, float]:
-    """Write what belongs to a moment; return its energies."""
-    line = snapshots.energies(model, s, scene)
-    snapshots.add_line(line, folder / "energies.csv", step)
-    rho, p = jax.jit(solver.density_and_pressure)(model, s, nbrs)
-    if how.pictures:
-        x, v = np.asarray(s.x), np.asarray(s.v)
-        top = max(np.linalg.norm(scene.velocities, axis=1).max(initial=0), line["top_speed"])
-        from jfrnn.sph import frames
+    def line(self, s: State, step: int) -> dict[str, float]:
+        """Add a line to each table, and return the energies."""
+        self._line = snapshots.energies(self._model, s, self._scene)
+        snapshots.add_line(self._line, self._folder / "energies.csv", step)
+        if self._probe is not None:
+            seen = self._probe(self._model, s).items()
+            values = {key: number for name, value in seen for key, number in columns(name, value).items()}
+            snapshots.add_line({"time": self._line["time"]} | values, self._folder / "probes.csv", step)
+        return self._line
 
-        frames.draw(scene, x, v, line["time"], float(top), folder / "frames" / f"{step:09d}.png")
-    snapshots.save(s, scene, np.asarray(rho), np.asarray(p), folder / "snapshots", step)
-    return line
+    def snapshot(self, s: State, nbrs: Neighbors, step: int) -> None:
+        """Write the state of the last line, and draw it."""
+        scene = self._scene
+        rho, p = jax.jit(solver.density_and_pressure)(self._model, s, nbrs)
+        if self._how.pictures:
+            from jfrnn.sph import frames
+
+            x, v, time = np.asarray(s.x), np.asarray(s.v), self._line["time"]
+            top = max(np.linalg.norm(scene.velocities, axis=1).max(initial=0), self._line["top_speed"])
+            there = snapshots.are_there(scene, s)
+            frames.draw(scene, there, x, v, time, float(top), self._folder / "frames" / f"{step:09d}.png")
+        snapshots.save(s, scene, np.asarray(rho), np.asarray(p), self._folder / "snapshots", step)

@@ -17,6 +17,12 @@ from jfrnn.sph.model import kind_of
 from jfrnn.sph.particles import Flow, State, Thermal
 
 
+def are_there(scene: Scene, s: State) -> np.ndarray:
+    """Return which particles have entered and not left, shape [n], bool."""
+    entered = np.ones(scene.n, bool) if scene.enters is None else scene.enters <= float(s.time)
+    return entered if s.gone is None else entered & ~np.asarray(s.gone)
+
+
 def save(state: State, scene: Scene, rho: np.ndarray, p: np.ndarray, folder: Path, step: int) -> None:
     """Write a state as STEP.npz, complete or not at all, and its particles that have entered as STEP.vtp."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -25,7 +31,7 @@ def save(state: State, scene: Scene, rho: np.ndarray, p: np.ndarray, folder: Pat
     if state.solid is not None and state.solid.angle is not None:
         arrays["angle"] = np.asarray(state.solid.angle)
     whole, part = folder / f"{step:09d}.npz", folder / "part.npz"
-    _write_vtk(arrays, scene, {"density": rho, "pressure": p}, whole.with_suffix(".vtp"))
+    _write_vtk(arrays, scene, are_there(scene, state), {"density": rho, "pressure": p}, whole.with_suffix(".vtp"))
     np.savez(part, **arrays)  # pyright: ignore[reportArgumentType]
     part.replace(whole)
 
@@ -59,9 +65,21 @@ def check_same(about: dict[str, Any], folder: Path) -> None:
         there = dict(json.loads(path.read_text()))
     except (TypeError, ValueError) as error:
         raise SceneError(f"{path}: says no run ({error}); take another folder, or remove it") from error
-    if there != (asked := json.loads(text)):
+    asked = json.loads(text)
+    if _goes_on(there, asked):
+        path.write_text(text)
+        return
+    if there != asked:
         different = [key for key in asked if asked[key] != there.get(key)]
         raise SceneError(f"{folder}: holds a run with another {', '.join(different)}; take another folder, or remove it")
+
+
+def _goes_on(there: dict[str, Any], asked: dict[str, Any]) -> bool:
+    """Say whether a run is another one for longer: with as many snapshots more, between which there is as much time."""
+    if there != asked | {key: there.get(key) for key in ("frames", "duration")}:
+        return False
+    (frames, duration), (more, longer) = ((about["frames"], about["duration"]) for about in (there, asked))
+    return more > frames and abs(longer * frames - duration * more) <= 1e-9 * duration * more
 
 
 def _take(folder: Path) -> Path:
@@ -79,8 +97,9 @@ def _take(folder: Path) -> Path:
 def energies(model: Flow, state: State, scene: Scene) -> dict[str, float]:
     """Return a line of the energies: time [s], `solver.energies` [J] and their total, momentum [kg m/s], largest speed [m/s].
 
-    Of a gas, also the largest smoothing length over the smallest. Where there is a solid, also the least signed distance to it [m],
-    infinite where nothing is within its reach.
+    Of a gas, also the largest smoothing length over the smallest. Where particles enter or leave, also the masses that came, that
+    left and that are there [kg; in 2D kg/m]. Where there is a solid, also the least signed distance to it [m], infinite where
+    nothing is within its reach.
     """
     moved = budget.momentum(model, state)
     fluid = np.ones(scene.n, bool) if scene.wall is None else ~scene.wall
@@ -88,11 +107,15 @@ def energies(model: Flow, state: State, scene: Scene) -> dict[str, float]:
         "time": float(state.time),
         **(held := {name: float(value) for name, value in solver.energies(model, state).items()}),
         **{f"momentum_{axis}": float(moved[k]) for k, axis in enumerate("xyz"[: scene.dim])},
-        "top_speed": float(np.linalg.norm(np.asarray(state.v)[fluid], axis=1).max(initial=0)),
+        "top_speed": float(np.linalg.norm(np.asarray(state.v)[fluid & are_there(scene, state)], axis=1).max(initial=0)),
     }
     line |= {"total": sum(held.values())}
     if state.gas is not None:
         line |= {"resolution": float(state.gas.h.max() / state.gas.h.min())}
+    if scene.enters is not None or state.gone is not None:
+        m, there = np.where(fluid, scene.masses, 0.0), are_there(scene, state)
+        left = np.zeros(scene.n, bool) if state.gone is None else np.asarray(state.gone)
+        line |= {"mass_in": m[there | left].sum(), "mass_out": m[left].sum(), "mass": m[there].sum()}
     distances = solids.clearance(scene, state)
     return line if distances is None else line | {"clearance": float(distances.min(initial=np.inf))}
 
@@ -107,10 +130,9 @@ def add_line(line: dict[str, float], path: Path, step: int) -> None:
     part.replace(path)
 
 
-def _write_vtk(arrays: dict[str, np.ndarray], scene: Scene, values: dict[str, np.ndarray], path: Path) -> None:
+def _write_vtk(arrays: dict[str, np.ndarray], scene: Scene, there: np.ndarray, values: dict[str, np.ndarray], path: Path) -> None:
     import pyvista
 
-    there = np.ones(scene.n, bool) if scene.enters is None else scene.enters <= arrays["time"]
     flat = ((0, 0), (0, 3 - scene.dim))
     cloud = pyvista.PolyData(np.pad(arrays["x"][there], flat))
     cloud.point_data["velocity"] = np.pad(arrays["v"][there], flat)

@@ -21,9 +21,10 @@ from jax import Array
 import jfrnn
 from jfrnn.cases import fluids
 from jfrnn.cases.fluids import FluidScene, Scene, Turning
+from jfrnn.sph.errors import SceneError
 from jfrnn.sph.kernels import KERNELS, Kernel
 from jfrnn.sph.pairs import reach
-from jfrnn.sph.particles import Beside, Model, State
+from jfrnn.sph.particles import Beside, Model, State, active
 
 GAP = 0.2  # particle spacings: on a lattice, particles at a wall are half a spacing away
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
@@ -39,7 +40,7 @@ def begin(scene: FluidScene, x: Array, angle: Array | None = None) -> Beside | N
         angle: By which the wall has turned [rad].
 
     Raises:
-        ValueError: The mesh is not closed, or a particle of the fluid is in it.
+        SceneError: The mesh is not closed, or a particle of the fluid is in it.
     """
     solid = scene.solid
     if solid is None:
@@ -52,9 +53,11 @@ def begin(scene: FluidScene, x: Array, angle: Array | None = None) -> Beside | N
     angle = jnp.zeros((), x.dtype) if turning is not None and angle is None else angle
     at = into_frame(x, turning, angle)
     tri = jfrnn.search_triangles(at, vertices, faces, cutoff, capacity=capacity)
+    if tri.overflow:  # in a finely meshed solid, in the middle of which more triangles are near than anywhere on it
+        tri = jfrnn.search_triangles(at, vertices, faces, cutoff)
     signed = tri.signed_distance(at)
     if not signed.watertight:
-        raise ValueError(
+        raise SceneError(
             "solid must be a closed mesh whose faces run counterclockwise as seen from the fluid: they run through one side more "
             "often one way than the other. If corners are written once per triangle, as in STL files, join them first."
         )
@@ -62,7 +65,7 @@ def begin(scene: FluidScene, x: Array, angle: Array | None = None) -> Beside | N
     if scene.wall is not None:
         inside = inside & ~scene.wall
     if inside.any():
-        raise ValueError(
+        raise SceneError(
             f"positions of the fluid must be outside the solid by {GAP / 2} spacings: particle {inside.argmax()} is not."
         )
     return Beside(tri, angle, signed.mask, signed.distance, signed.normal)
@@ -200,7 +203,8 @@ class _Acting(NamedTuple):
 
 
 def _find_acting(model: Model, s: State, beside: Beside) -> _Acting:
-    mask = beside.mask if model.enters is None else beside.mask & (s.time >= model.enters)
+    there = active(model, s)
+    mask = beside.mask if there is None else beside.mask & there
     distance = jnp.where(mask, jnp.maximum(beside.distance, 0), 0)
     sums = integrate_missing(model.kernel, distance, model.physics.smoothing, s.x.shape[1])
     area, weight = (jnp.where(mask, part, 0) for part in sums)

@@ -18,10 +18,10 @@ from jax.sharding import Mesh
 
 from jfrnn import distributed
 from jfrnn.distributed import Halo, Particles
-from jfrnn.sph import forces, solver
-from jfrnn.sph.particles import Model, State
+from jfrnn.sph import solver
+from jfrnn.sph.particles import Model, State, active
 
-OF_STATE = ("v", "a", "rho", "p", "w")  # what of a state is known of each particle, besides positions
+OF_STATE = ("v", "a", "rho", "p", "w", "gone")  # what of a state is known of each particle, besides positions
 _OF_MODEL = ("m", "wall", "enters")
 _NEVER = np.inf
 
@@ -120,7 +120,7 @@ def begin(flow: Flow) -> Flow:
     """Return what its integrator carries from step to step, as `solver.begin`."""
 
     def first(model: Model, s: State, nbrs: Any) -> tuple[State, Any]:  # noqa: ANN401
-        nbrs = nbrs.update(s.x, active=forces.active(model, s.time))
+        nbrs = nbrs.update(s.x, active=active(model, s))
         return solver.begin(model, s, nbrs), nbrs
 
     return _run(flow, jax.jit(partial(_with_solver, first)))

@@ -1,6 +1,7 @@
 """Viscosity: each function but `artificial` returns what neighbor j adds to the acceleration of i [m/s²], shape [d].
 
-Velocities are read from `u`: those of particles, and of wall dummies what holds the fluid or lets it slip.
+Velocities are read from `u`: those of particles, and of wall dummies what holds the fluid or lets it slip. All forms are
+antisymmetric in mass times acceleration: with them momentum is kept to the rounding of the sums.
 """
 
 import jax.numpy as jnp
@@ -10,8 +11,11 @@ from jfrnn.sph.pairs import Pair, Values
 
 
 def morris(pair: Pair, i: Values, j: Values, viscosity: Array) -> Array:
-    """Return 2ν m_j/ρ_j F (u_i - u_j), ν kinematic [m²/s]. Source: Morris, Fox & Zhu (1997), doi:10.1006/jcph.1997.5776, eq. 22."""
-    return 2 * viscosity * j["volume"] * pair.pull * (i["u"] - j["u"])
+    """Return m_j (μ_i + μ_j)/(ρ_i ρ_j) F (u_i - u_j), μ = ρν, ν kinematic [m²/s].
+
+    Source: Morris, Fox & Zhu (1997), doi:10.1006/jcph.1997.5776, eq. 22.
+    """
+    return viscosity * (i["rho"] + j["rho"]) * i["specific"] * j["volume"] * pair.pull * (i["u"] - j["u"])
 
 
 def volume(pair: Pair, i: Values, j: Values, viscosity: Array) -> Array:

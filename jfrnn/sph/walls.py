@@ -45,7 +45,7 @@ def extrapolate(sums: dict[str, Array], wall_velocity: Array, gravity: Array | N
 
     Source: Adami, Hu & Adams (2012), doi:10.1016/j.jcp.2012.05.005, eqs. 23 and 27.
     """
-    met = sums["weight"] > 0
+    met = sums["weight"] > jnp.finfo(sums["weight"].dtype).smallest_normal ** 0.5  # whose square is a divisor of derivatives
     weight = jnp.where(met, sums["weight"], 1)
     pressure = sums["p"] if gravity is None else sums["p"] + jnp.sum(sums["moment"] * gravity, axis=1)
     held = 2 * wall_velocity - sums["v"] / weight[:, None]

@@ -32,7 +32,7 @@ WHERE_NEEDED = {  # third-party modules that single files import where they are 
     "_engine/start.py": {"warp"},
     "sph/frames.py": {"matplotlib", "PIL"},
     "sph/ranges.py": {"pydantic"},
-    "sph/settings.py": {"trimesh"},
+    "sph/files.py": {"trimesh"},
     "sph/snapshots.py": {"pyvista"},
 }
 PUBLIC = {"Box", "EdgeList", "MemoryPlan", "NeighborList", "NeighborOverflowError", "Status", "TriangleList"}

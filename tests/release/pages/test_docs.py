@@ -14,7 +14,7 @@ import jfrnn
 from experiments import pages
 from experiments._errors import UsageError
 from experiments.pages.rows import TIMES
-from jfrnn import distributed
+from jfrnn import distributed, sph
 from jfrnn._engine import ENGINES, Kind
 from jfrnn._shards.calls import BACKENDS
 from jfrnn._triangles.engines import TRIANGLE_ENGINES
@@ -32,7 +32,11 @@ GROUPS = {
     "readme": ["README.md", "docs/index.md", "docs/start.md"],
     "guides": sorted(f"docs/guides/{path.name}" for path in (ROOT / "docs/guides").glob("*.md")),
     "coming_from": sorted(f"docs/coming-from/{path.name}" for path in (ROOT / "docs/coming-from").glob("*.md")),
-    "rest": ["docs/sph.md", *sorted(f"docs/developers/{path.name}" for path in (ROOT / "docs/developers").glob("*.md"))],
+    "rest": [
+        "docs/sph.md",
+        "docs/own-scene.md",
+        *sorted(f"docs/developers/{path.name}" for path in (ROOT / "docs/developers").glob("*.md")),
+    ],
 }
 
 
@@ -70,6 +74,7 @@ def test_pages_build(tmp_path):
     html = {path.stem: path.read_text(encoding="utf-8") for path in (tmp_path / "api").glob("*.html")}
     missing = [name for name in jfrnn.__all__ if f'id="jfrnn.{name}"' not in html["jfrnn"]]
     missing += [name for name in distributed.__all__ if f'id="jfrnn.distributed.{name}"' not in html["distributed"]]
+    missing += [name for name in sph.__all__ if f'id="jfrnn.sph.{name}"' not in html["sph"]]
     assert missing == []
 
 

@@ -11,6 +11,7 @@ from jfrnn.cases import fluids
 from jfrnn.cases._fluid_flows import taylor_green_velocity
 from jfrnn.sph import budget, forces, health, solver
 from jfrnn.sph.model import make_model, make_state
+from jfrnn.sph.particles import active
 
 
 def begun(scene, backend="auto"):
@@ -123,9 +124,9 @@ def test_scenes_with_walls_keep_their_fluid(name, settings):
 def test_a_jet_enters_layer_by_layer():
     scene = fluids.fluid("jet", layers=4, duration=2e-3)
     model, s = begun(scene)
-    assert forces.active(model, s.time).sum() == 12 + scene.wall.sum()
+    assert active(model, s).sum() == 12 + scene.wall.sum()
     _, s = run(scene, time=1.75e-3)
-    waiting = np.asarray(~forces.active(model, s.time))
+    waiting = np.asarray(~active(model, s))
     assert 0 < waiting.sum() < (~scene.wall).sum()
     np.testing.assert_array_equal(np.asarray(s.x)[waiting], scene.positions[waiting])
     front = np.asarray(s.x)[:12, 2]

@@ -1,6 +1,10 @@
 """`python -m jfrnn.sph run`: what a run writes, how it goes on after a kill, and what it says when it goes wrong."""
 
 import json
+import os
+import signal
+import threading
+import time
 
 import numpy as np
 import pytest
@@ -12,8 +16,9 @@ from jfrnn._triangles.winding import is_closed
 from jfrnn.cases import fluids, meshes
 from jfrnn.sph import health, runs
 from jfrnn.sph.errors import SceneError
+from jfrnn.sph.files import read_solid, with_solid
 from jfrnn.sph.model import make_model, make_state
-from jfrnn.sph.settings import _read_mesh, make_scene, with_solid
+from jfrnn.sph.settings import make_scene
 
 FEW = ("--frames", 3, "--set", "duration=0.003")
 
@@ -55,6 +60,39 @@ def test_a_killed_run_goes_on_to_the_same_end(tmp_path, neighbors):
     tolerance = 0 if neighbors == "pair_sum" else 1e-9  # a list that is made anew may order its rows, and their sums, otherwise
     np.testing.assert_allclose(*tables, rtol=tolerance)
     np.testing.assert_allclose(load(whole, 30)["x"], load(killed, 30)["x"], rtol=tolerance)
+
+
+def test_stopped_runs_go_on_to_the_same_end(tmp_path, tries=3):
+    """Ctrl-C at any time, also while JAX calls back into Python, ends a run with 130; the same command then ends as a whole one."""
+    options = ("four", "--set", "duration=0.004", "--frames", 4, "--no-pictures")
+    whole, random, stopped, late = tmp_path / "whole", np.random.default_rng(0), 0, []
+    invoke(*options, "--out", whole)
+    before = signal.signal(signal.SIGINT, lambda *_: late.append(1))  # what comes before or after a run
+    start = time.perf_counter()
+    invoke(*options, "--out", tmp_path / "again")
+    seconds = time.perf_counter() - start
+    try:
+        for k in range(tries):
+            folder = tmp_path / f"{k}"
+            timer = threading.Timer(random.uniform(0, seconds), os.kill, (os.getpid(), signal.SIGINT))
+            timer.start()
+            code, _, said = invoke(*options, "--out", folder)
+            timer.join()
+            assert (code, "stopped; the same command goes on" in said) in ((0, False), (130, True))
+            stopped += code == 130
+            assert code == 0 or invoke(*options, "--out", folder)[0] == 0
+            for name in ("x", "v", "time"):
+                np.testing.assert_array_equal(load(folder, 40)[name], load(whole, 40)[name])
+            assert (folder / "energies.csv").read_bytes() == (whole / "energies.csv").read_bytes()
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert stopped + len(late) >= tries - 1  # the last may come after the end of its run, before the timer is joined
+    assert stopped > tries // 4
+
+
+@pytest.mark.slow
+def test_each_of_200_stopped_runs_goes_on_to_the_same_end(tmp_path):
+    test_stopped_runs_go_on_to_the_same_end(tmp_path, 200)
 
 
 def test_given_particles_replace_those_of_the_scene(tmp_path):
@@ -156,11 +194,11 @@ def test_walls_that_cannot_be_meant_are_refused(tmp_path, scene, center, edge, u
 @pytest.mark.parametrize("ending", ["stl", "obj", "ply"])
 def test_files_that_hold_no_wall_are_refused(tmp_path, ending):
     code, _, error = invoke("jet", "--solid", tmp_path / f"none.{ending}")
-    assert (code, f"--solid {tmp_path}/none.{ending} is no file: name an STL, OBJ or PLY." in error) == (2, True)
+    assert (code, f"solid {tmp_path}/none.{ending} is no file: name an STL, OBJ or PLY." in error) == (2, True)
     for text in (b"", b"solid\n facet", b"\x00\xff" * 50, b"ply\nformat ascii 1.0\n", b"f 1 2 3\nv 0 0"):
         (tmp_path / f"broken.{ending}").write_bytes(text)
         code, _, error = invoke("jet", "--solid", tmp_path / f"broken.{ending}")
-        assert (code, error.startswith(f"error: --solid {tmp_path}/broken.{ending} "), error.count("\n")) == (2, True, 1)
+        assert (code, error.startswith(f"error: solid {tmp_path}/broken.{ending} "), error.count("\n")) == (2, True, 1)
 
 
 def test_a_wall_that_is_open_is_refused_before_a_folder_is_made(tmp_path):
@@ -189,7 +227,8 @@ def test_meshes_are_read(tmp_path, kind):
     vertices, faces = meshes.sphere(2.0, 3)
     path = tmp_path / f"sphere.{kind}"
     trimesh.Trimesh(vertices, faces, process=False).export(path)
-    points, named = _read_mesh(path)
+    solid = read_solid(path)
+    points, named = solid.vertices, solid.faces
     assert (points.shape, named.shape, named.dtype) == (vertices.shape, faces.shape, np.int32)
     assert np.allclose(
         np.sort(points[named].reshape(len(faces), -1), axis=0), np.sort(vertices[faces].reshape(len(faces), -1), axis=0), atol=1e-6
@@ -198,7 +237,7 @@ def test_meshes_are_read(tmp_path, kind):
 
 def test_what_is_no_mesh_is_refused(tmp_path):
     with pytest.raises(SceneError, match="is no file"):
-        _read_mesh(tmp_path / "none.stl")
+        read_solid(tmp_path / "none.stl")
     (tmp_path / "text.txt").write_text("no mesh")
     with pytest.raises(SceneError, match=r"is no mesh|holds no triangles"):
-        _read_mesh(tmp_path / "text.txt")
+        read_solid(tmp_path / "text.txt")

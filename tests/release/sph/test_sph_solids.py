@@ -11,6 +11,7 @@ from test_sph_commands import invoke
 
 from jfrnn.cases import fluids, meshes
 from jfrnn.sph import budget, health, solids, solver, view
+from jfrnn.sph.errors import SceneError
 from jfrnn.sph.kernels import KERNELS
 from jfrnn.sph.model import make_model, make_state
 
@@ -234,6 +235,13 @@ def test_fluid_in_the_solid_and_open_meshes_are_refused():
         make_state(replace(scene, positions=scene.positions - [0, 1.8]))
     with pytest.raises(ValueError, match="solid must be a closed mesh"):
         make_state(replace(scene, solid=replace(scene.solid, faces=scene.solid.faces[1:])))
+
+
+def test_fluid_in_a_finely_meshed_solid_is_refused_alike():
+    """In the middle of a ball smaller than the cutoff, three times as many triangles are near as anywhere on it."""
+    scene = beside(fluids.Solid(*meshes.sphere(0.28, 12)), np.zeros((1, 3)), 0.1)
+    with pytest.raises(SceneError, match=r"positions of the fluid must be outside the solid by 0.1 spacings: particle 0 is not"):
+        make_state(scene)
 
 
 @pytest.mark.parametrize("integrator", ["symplectic", "midpoint"])

@@ -1,0 +1,176 @@
+"""What a scene must be like to be run, whoever made it: each mistake is one sentence that names the field."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import fields
+from typing import Any, get_type_hints
+
+import jax
+import numpy as np
+from jax.core import Tracer
+
+from jfrnn.cases import fluids
+from jfrnn.cases.fluids import FluidScene, GasScene, Scene
+from jfrnn.sph import ranges
+from jfrnn.sph.errors import SceneError
+from jfrnn.sph.kernels import KERNELS
+
+_HINTS = {"Number": float, "Vector": tuple[float, ...]}
+PHYSICS, PHYSICS_OF_GASES = (get_type_hints(kind, localns=_HINTS) for kind in (fluids.Physics, fluids.Gas))
+LEAST_SMOOTHING, MOST_SMOOTHING = 0.1, 50.0  # in particle spacings
+MOST_STEPS = 1e9
+_PER_PARTICLE = {"velocities": "nd", "masses": "n", "energies": "n", "enters": "n", "densities": "n", "pressures": "n"}
+_OPTIONAL = ("enters", "densities", "pressures")
+
+
+def check_scene(scene: Scene) -> None:
+    """Refuse a scene that cannot be run.
+
+    Raises:
+        SceneError: Names the field, says what it is, and what to do.
+    """
+    if not isinstance(scene, FluidScene | GasScene):
+        raise SceneError(f"scene must be a FluidScene or a GasScene, got {_kind(scene)}.")
+    _check_particles(scene)
+    for name in ("spacing", "duration"):
+        _check_number(name, getattr(scene, name))
+    _check_steps(scene)
+    for name, place in (("tank", scene.tank), ("bounds", scene.bounds), ("sealed", scene.sealed), ("outflow", scene.outflow)):
+        if place is not None:
+            _check_corners(name, place.lower, place.upper, scene.dim)
+    if scene.periodic is not None:
+        box = scene.periodic
+        upper = [low + length for low, length in zip(box.lower, box.lengths, strict=False)]
+        _check_corners("periodic", box.lower, upper, scene.dim)
+        if len(box.axes) != scene.dim or not all(isinstance(axis, bool | np.bool_) for axis in box.axes):
+            raise SceneError(f"periodic.axes must say of each of {scene.dim} axes True or False, got {box.axes!r}.")
+    if scene.solid is not None:
+        _check_solid(scene.solid, scene.dim)
+    _check_physics(scene.physics, PHYSICS if isinstance(scene, FluidScene) else PHYSICS_OF_GASES)
+    if isinstance(scene, FluidScene):
+        _check_fluid(scene)
+
+
+def _kind(value: object) -> str:
+    if isinstance(value, np.ndarray | jax.Array):
+        return f"an array of shape {list(value.shape)}, {value.dtype}"
+    return f"{type(value).__name__} {value!r}"[:80]
+
+
+def _check_array(name: str, value: object, shape: tuple[int | None, ...], what: str) -> np.ndarray:
+    """Return a real array of a shape, of which None is any number."""
+    if not isinstance(value, np.ndarray | jax.Array):
+        raise SceneError(f"{name} must be an array of shape {what}, got {_kind(value)}: take numpy.asarray({name}, float).")
+    array = np.asarray(value)
+    fits = len(shape) == array.ndim and all(want in (None, got) for want, got in zip(shape, array.shape, strict=False))
+    if not fits or array.dtype.kind not in "fiu":
+        raise SceneError(f"{name} must be an array of shape {what}, real numbers, got {_kind(value)}.")
+    return array
+
+
+def _check_particles(scene: FluidScene | GasScene) -> None:
+    positions = _check_array("positions", scene.positions, (None, None), "[n, d]")
+    n, dim = positions.shape
+    if dim not in (2, 3):
+        raise SceneError(f"positions must be an array of shape [n, 2] or [n, 3], got {_kind(scene.positions)}.")
+    if n == 0:
+        raise SceneError("positions has no particle of fluid: make it larger, or its particles smaller.")
+    if not np.isfinite(positions).all():
+        raise SceneError(f"positions are not finite: particle {int(np.argwhere(~np.isfinite(positions))[0][0])} is not.")
+    for name, what in _PER_PARTICLE.items():
+        value = getattr(scene, name, None)
+        if value is None and (name in _OPTIONAL or not hasattr(scene, name)):
+            continue
+        shape = (n, dim) if what == "nd" else (n,)
+        array = _check_array(name, value, shape, f"{list(shape)}, as positions say")
+        if np.isnan(array).any() or (name != "enters" and not np.isfinite(array).all()):
+            raise SceneError(f"{name} are not finite: that of particle {int(np.argwhere(~np.isfinite(array))[0][0])} is not.")
+        if name in ("masses", "densities") and not (array > 0).all():
+            raise SceneError(f"{name} must be above 0: particle {int(np.argmin(array))} has {array.min()}.")
+    if scene.wall is not None:
+        if not isinstance(scene.wall, np.ndarray | jax.Array) or scene.wall.shape != (n,) or scene.wall.dtype != bool:
+            raise SceneError(f"wall must be an array of shape [{n}], bool, or None, got {_kind(scene.wall)}.")
+        if scene.wall.all():
+            raise SceneError("wall: there is no particle of fluid beside those of the wall: make the scene larger.")
+
+
+def _check_number(name: str, value: Any, least: float = 0.0) -> float:  # noqa: ANN401
+    """Return a finite number above a bound."""
+    number = value if isinstance(value, int | float) else value.item() if isinstance(value, np.generic) else None
+    if isinstance(number, bool) or not isinstance(number, int | float):
+        raise SceneError(f"{name} must be a number, got {_kind(value)}.")
+    if not least < number < math.inf:
+        raise SceneError(f"{name} must be a finite number above {least:g}, got {number!r}.")
+    return float(number)
+
+
+def _check_steps(scene: Scene) -> None:
+    """Refuse steps that come to no end."""
+    if scene.step is None:
+        return
+    _check_number("step", scene.step)
+    if scene.step < scene.duration / MOST_STEPS:
+        raise SceneError(
+            f"step: takes steps of {scene.step:.3g} s for {scene.duration:.3g} s, expected up to {MOST_STEPS:.0e} steps"
+        )
+
+
+def _check_corners(name: str, lower: Sequence[float], upper: Sequence[float], dim: int) -> None:
+    for part, corner in (("lower", lower), ("lengths" if name == "periodic" else "upper", upper)):
+        if len(corner) != dim or any(np.isnan(corner)):
+            raise SceneError(f"{name}.{part} must have a number for each of {dim} axes, got {len(corner)}: {tuple(corner)!r}.")
+    if not all(low < high for low, high in zip(lower, upper, strict=True)):
+        raise SceneError(f"{name} must reach from a lower to an upper corner, got {tuple(lower)!r} and {tuple(upper)!r}.")
+
+
+def _check_solid(solid: fluids.Solid, dim: int) -> None:
+    vertices = _check_array("solid.vertices", solid.vertices, (None, dim), f"[v, {dim}]")
+    faces = _check_array("solid.faces", solid.faces, (None, dim), f"[f, {dim}]")
+    if not np.isfinite(vertices).all():
+        raise SceneError("solid.vertices are not finite.")
+    if faces.dtype.kind == "f" or (faces.size and not 0 <= faces.min() <= faces.max() < len(vertices)):
+        raise SceneError(f"solid.faces must be whole numbers from 0 to {len(vertices) - 1}, numbers of vertices.")
+    if (turning := solid.turning) is not None:
+        wanted = {"center": turning.center, "axis": turning.axis} if dim == len("xyz") else {"center": turning.center}
+        for name, vector in wanted.items():
+            if vector is None or len(vector) != dim:
+                raise SceneError(f"solid.turning.{name} must have a number for each of {dim} axes, got {vector!r}.")
+
+
+def _check_physics(physics: Any, kinds: dict[str, Any]) -> None:  # noqa: ANN401
+    """Refuse what the command line would; numbers that are traced have no value to look at."""
+    for field in fields(physics):
+        value = getattr(physics, field.name)
+        if isinstance(value, Tracer):
+            continue
+        value = np.asarray(value).tolist() if isinstance(value, np.ndarray | np.generic | jax.Array) else value
+        try:
+            ranges.read(kinds[field.name], value, ranges.RANGES.get(field.name))
+        except ValueError as error:
+            raise SceneError(f"physics.{field.name}: got {value!r}; {error}") from error
+
+
+def _check_fluid(scene: FluidScene) -> None:
+    """Refuse physics that does not go with where the particles are."""
+    physics, smoothing = scene.physics, float(scene.physics.smoothing) / scene.spacing
+    if physics.gravity is not None and len(physics.gravity) != scene.dim:
+        raise SceneError(f"gravity has {len(physics.gravity)} components, expected {scene.dim} in {scene.dim}D")
+    if not LEAST_SMOOTHING <= smoothing <= MOST_SMOOTHING:
+        spacing = f"{LEAST_SMOOTHING:g} to {MOST_SMOOTHING:g} particle spacings of {scene.spacing:.4g} m"
+        raise SceneError(f"smoothing is {physics.smoothing:.4g} m, expected {spacing}")
+    _check_thickness(scene)
+
+
+def _check_thickness(scene: FluidScene) -> None:
+    """Refuse walls of dummies through which particles would see the empty space behind."""
+    if scene.wall is None or scene.sealed is None:
+        return
+    support = KERNELS[scene.physics.kernel].support
+    reach, dummies, half = support * scene.physics.smoothing, scene.positions[scene.wall], scene.spacing / 2
+    depths = [np.array(scene.sealed.lower) - dummies.min(axis=0), dummies.max(axis=0) - np.array(scene.sealed.upper)]
+    thick = [depth + half for side in depths for depth in side if np.isfinite(depth) and depth > 0]
+    if thick and min(thick) < reach - 1.001 * half:
+        raise SceneError(
+            f"physics.kernel {scene.physics.kernel!r} reaches {support:g} smoothing lengths, {reach:.4g} m, but a wall of dummies "
+            f"is {min(thick):.4g} m thick: take a smoothing up to {(min(thick) + half) / support:.4g} m, or thicker walls."
+        )

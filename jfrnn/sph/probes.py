@@ -1,0 +1,135 @@
+"""What may be measured as a run goes on: functions of a model and a state, for `run(probes=...)` and for `jax.jit`."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jfrnn.sph import solids, solver
+from jfrnn.sph.errors import SceneError
+from jfrnn.sph.forces import fluid
+from jfrnn.sph.pairs import Pair, Values, total
+from jfrnn.sph.particles import Flow, Model, State, active, mass_there, own_acceleration
+
+Probe = Callable[[Any, State], Any]
+"""(model, state) -> numbers, arrays, or a dict of them; inside jit."""
+
+
+def pressure_at(points: Any) -> Probe:  # noqa: ANN401
+    """Return a probe of the pressures of a fluid [Pa], shape [k], at points [m], shape [k, d]; 0 where no fluid is near.
+
+    Source: Shepard (1968), doi:10.1145/800186.810616: the mean over the fluid, weighed by volumes times the kernel.
+    """
+
+    def probe(model: Model, s: State) -> Array:
+        at = jnp.asarray(points, s.x.dtype)
+        if at.ndim != 2 or at.shape[1] != s.x.shape[1]:
+            raise SceneError(f"points must have shape [k, {s.x.shape[1]}], got {list(at.shape)}.")
+        rho, p = solver.density_and_pressure(model, s)
+        values = {"volume": model.m / rho, "p": p} | ({} if model.wall is None else {"wall": model.wall})
+
+        def term(pair: Pair, i: Values, j: Values) -> dict[str, Array]:
+            weight = fluid(j, j["volume"] * pair.weight)
+            return {"weight": weight, "p": weight * j["p"]}
+
+        options = {"box": model.box, "active": active(model, s), "queries": at, "query_values": {"p": jnp.zeros_like(at[:, 0])}}
+        sums = total(term, s.x, values, model.kernel, model.physics.smoothing, backend=model.backend, **options)
+        met = sums["weight"] > jnp.finfo(s.x.dtype).smallest_normal ** 0.5  # whose square is a divisor of derivatives
+        return jnp.where(met, sums["p"] / jnp.where(met, sums["weight"], 1), 0)
+
+    return probe
+
+
+def flow_through(point: Sequence[float], normal: Sequence[float], width: float) -> Probe:
+    """Return a probe of the mass that goes through a plane [kg/s; in 2D kg/m/s], shape []: Σ m v·n/width of a slice around it.
+
+    Args:
+        point: In the plane [m], d numbers.
+        normal: Across it, of any length.
+        width: Of the slice [m]: some particle spacings.
+    """
+
+    def probe(model: Flow, s: State) -> Array:
+        n = jnp.asarray(np.asarray(normal, float) / np.linalg.norm(normal), s.x.dtype)
+        near = jnp.abs((s.x - jnp.asarray(point, s.x.dtype)) @ n) < width / 2
+        return jnp.sum(jnp.where(near, mass_there(model, s) * (s.v @ n), 0)) / width
+
+    return probe
+
+
+def surface_height(place: Sequence[float], radius: float) -> Probe:
+    """Return a probe of the height of the fluid's uppermost particle [m], shape [], over a place; -inf where there is none.
+
+    Args:
+        place: All coordinates but the last one [m].
+        radius: How far from the place particles count [m]: some particle spacings.
+    """
+
+    def probe(model: Flow, s: State) -> Array:
+        aside = jnp.linalg.norm(s.x[:, :-1] - jnp.asarray(place, s.x.dtype), axis=1)
+        there = (aside < radius) & (mass_there(model, s) > 0)
+        return jnp.max(jnp.where(there, s.x[:, -1], -jnp.inf))
+
+    return probe
+
+
+def force_on_walls(about: Sequence[float] | None = None) -> Probe:
+    """Return a probe of the force [N] on all walls, of dummies and of triangles, and of its torque [N m].
+
+    What the walls do to the fluid is what is left of Σ m a without gravity and an own force. So it is right for forms of pressure
+    and viscosity that keep momentum, without damping, and torque as far as forces of pairs are along their distances.
+
+    Args:
+        about: What torque is taken about [m], d numbers; None: the origin.
+
+    Returns:
+        A probe of {"force": shape [d], "torque": shape [3], in 2D []}.
+    """
+
+    def probe(model: Model, s: State) -> dict[str, Array]:
+        a = s.a if model.physics.gravity is None else s.a - model.physics.gravity
+        own = own_acceleration(model, s)
+        moved = mass_there(model, s)
+        if model.enters is not None and model.guided is not None:
+            moved = jnp.where(s.time < model.enters + model.guided, 0, moved)
+        return _force_and_torque(-moved[:, None] * (a if own is None else a - own), s.x, about)
+
+    return probe
+
+
+def force_on_solid(about: Sequence[float] | None = None) -> Probe:
+    """Return a probe of the force [N] on the wall of triangles, and of its torque [N m]: exactly what it does to the fluid, turned.
+
+    Args:
+        about: As in `force_on_walls`.
+
+    Returns:
+        A probe of {"force": shape [d], "torque": shape [3], in 2D []}.
+    """
+
+    def probe(model: Model, s: State) -> dict[str, Array]:
+        if s.solid is None:
+            raise SceneError("solid must be there for a probe of the force on it, got None.")
+        rho, p = solver.density_and_pressure(model, s)
+        return _force_and_torque(-mass_there(model, s)[:, None] * solids.push(model, s, s.solid, rho, p), s.x, about)
+
+    return probe
+
+
+def _force_and_torque(forces: Array, x: Array, about: Sequence[float] | None) -> dict[str, Array]:
+    r = x if about is None else x - jnp.asarray(about, x.dtype)
+    if x.shape[1] == 2:
+        return {"force": jnp.sum(forces, axis=0), "torque": jnp.sum(r[:, 0] * forces[:, 1] - r[:, 1] * forces[:, 0])}
+    return {"force": jnp.sum(forces, axis=0), "torque": jnp.sum(jnp.cross(r, forces), axis=0)}
+
+
+def columns(name: str, value: Any) -> dict[str, float]:  # noqa: ANN401
+    """Return what a probe gave as columns of a table: "name", "name_key" of a dict, "name_0", "name_1" ... of an array."""
+    if isinstance(value, dict):
+        return {key: number for part, inner in value.items() for key, number in columns(f"{name}_{part}", inner).items()}
+    array = np.asarray(value, np.float64)
+    if array.ndim == 0:
+        return {name: float(array)}
+    return {f"{name}_{k}": float(number) for k, number in enumerate(array.reshape(-1))}

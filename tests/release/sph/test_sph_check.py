@@ -1,0 +1,94 @@
+"""A scene that was made in Python is refused by the same sentences as one of the command line, wherever it enters."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from test_sph_run import write_cube
+
+from jfrnn.cases import fluids
+from jfrnn.sph import check_scene, make_model, make_state, with_solid
+from jfrnn.sph.errors import SceneError
+
+PHYSICS = fluids.Physics(density=1000.0, sound_speed=10.0, smoothing=0.15, gravity=(0.0, -9.81))
+POSITIONS = np.random.default_rng(0).random((5, 2))
+SCENE = fluids.FluidScene(
+    name="own",
+    positions=POSITIONS,
+    velocities=np.zeros((5, 2)),
+    masses=np.ones(5),
+    spacing=0.1,
+    duration=1.0,
+    step=None,
+    physics=PHYSICS,
+)
+BOX = fluids.Tank((0.0, 0.0), (1.0, 1.0))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"positions": POSITIONS.tolist()}, r"positions must be an array of shape \[n, d\], got list .*: take numpy.asarray"),
+        (
+            {"positions": POSITIONS[:, :1]},
+            r"positions must be an array of shape \[n, 2\] or \[n, 3\], got an array of shape",
+        ),
+        ({"positions": POSITIONS * np.nan}, "positions are not finite: particle 0 is not"),
+        (
+            {"velocities": np.zeros((4, 2))},
+            r"velocities must be an array of shape \[5, 2\], as positions say.* got an array",
+        ),
+        ({"masses": 1.0}, r"masses must be an array of shape \[5\], as positions say, got float 1.0"),
+        ({"masses": np.arange(5.0)}, "masses must be above 0: particle 0 has 0.0"),
+        ({"wall": np.zeros(5)}, r"wall must be an array of shape \[5\], bool, or None, got an array of shape \[5\], float64"),
+        ({"wall": np.ones(5, bool)}, "wall: there is no particle of fluid"),
+        ({"enters": np.zeros(4)}, r"enters must be an array of shape \[5\]"),
+        ({"duration": 0.0}, "duration must be a finite number above 0, got 0.0"),
+        ({"duration": "1"}, "duration must be a number, got str '1'"),
+        ({"spacing": np.inf}, "spacing must be a finite number above 0, got inf"),
+        ({"step": -1.0}, "step must be a finite number above 0, got -1.0"),
+        ({"step": 1e-12}, "step: takes steps of 1e-12 s for 1 s, expected up to"),
+        ({"tank": fluids.Tank((0.0,) * 3, (1.0,) * 3)}, r"tank.lower must have a number for each of 2 axes, got 3"),
+        ({"sealed": fluids.Tank((1.0, 0.0), (0.0, 1.0))}, "sealed must reach from a lower to an upper corner"),
+        ({"periodic": fluids.Periodic((0.0, 0.0), (1.0, 1.0), (True,))}, "periodic.axes must say of each of 2 axes"),
+        ({"solid": fluids.Solid(np.zeros((3, 2)), np.array([[0, 1], [1, 3]]))}, "solid.faces must be whole numbers from 0 to 2"),
+        ({"physics": replace(PHYSICS, gravity=(0.0, 0.0, -9.81))}, "gravity has 3 components, expected 2 in 2D"),
+        ({"physics": replace(PHYSICS, kernel="gauss")}, r"physics.kernel: got 'gauss'; input should be 'cubic', "),
+        ({"physics": replace(PHYSICS, density=-1.0)}, r"physics.density: got -1.0; input should be greater than 0 \(above 0\)"),
+        (
+            {"physics": replace(PHYSICS, viscosity=np.float64(np.nan))},
+            "physics.viscosity: got nan; input should be a finite",
+        ),
+        ({"physics": replace(PHYSICS, smoothing=0.15e-3)}, "smoothing is 0.00015 m, expected 0.1 to 50 particle spacings of 0.1 m"),
+        (
+            {
+                "physics": replace(PHYSICS, kernel="quintic"),
+                "positions": np.array([[0.5, 0.05], [0.5, -0.05], [0.5, -0.15], [0.5, -0.25], [0.6, 0.05]]),
+                "wall": np.array([False, True, True, True, False]),
+                "sealed": BOX,
+            },
+            "physics.kernel 'quintic' reaches 3 smoothing lengths, 0.45 m, but a wall of dummies is 0.3 m thick: take a",
+        ),
+    ],
+)
+def test_a_mistake_in_a_scene_is_named(change, message):
+    check_scene(SCENE)
+    for act in (check_scene, make_model, make_state):
+        with pytest.raises(SceneError, match=message):
+            act(replace(SCENE, **change))
+
+
+def test_what_is_no_scene_is_refused():
+    with pytest.raises(SceneError, match="scene must be a FluidScene or a GasScene, got an array"):
+        make_model(POSITIONS)
+
+
+def test_a_solid_that_lies_beside_the_first_particles_is_taken(tmp_path):
+    """A block that falls on a cube 3 cm under it."""
+    positions = fluids.lattice((0.0,) * 3, (4, 4, 4), 0.01)
+    block = replace(SCENE, positions=positions, velocities=0 * positions, masses=np.ones(64), spacing=0.01)
+    block = replace(block, physics=replace(PHYSICS, smoothing=0.015, gravity=(0.0, 0.0, -9.81)))
+    under = write_cube(tmp_path / "cube.stl", (0.02, 0.02, -0.05), 0.04)
+    assert with_solid(block, under).solid.vertices.max(axis=0)[2] == pytest.approx(-0.03)
+    with pytest.raises(SceneError, match=r"reaches from .*; move it there, or name the unit of the file"):
+        with_solid(block, under, 20.0)

@@ -1,0 +1,88 @@
+"""What users bring and take: own forces, outflow, probes, a run that goes on for longer."""
+
+import json
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.tree_util import Partial
+
+from jfrnn import sph
+from jfrnn.sph.errors import SceneError
+from jfrnn.sph.particles import mass_there
+
+FEW = np.array([[0.0, 0.0], [10.0, 0.0], [0.0, 20.0]])  # none is near another
+FREE = sph.FluidScene(
+    name="free",
+    positions=FEW,
+    velocities=np.array([[1.0, 0.0], [0.0, 0.0], [0.0, -1.0]]),
+    masses=np.array([1.0, 2.0, 4.0]),
+    spacing=0.1,
+    duration=0.5,
+    step=0.01,
+    physics=sph.Physics(density=1.0, sound_speed=1.0, smoothing=0.15, pressure="mean", integrator="symplectic"),
+)
+
+
+def spring(stiffness, s):
+    return -stiffness * s.x
+
+
+def test_an_own_force_acts_as_it_says_and_its_parameter_is_traced():
+    """Free particles on springs."""
+    model = sph.make_model(FREE, backend="brute", force=Partial(spring, jnp.asarray(4.0)))
+    end, _ = sph.advance(model, sph.begin(model, sph.make_state(FREE)), None, 50)
+    t, w = 0.5, 2.0
+    np.testing.assert_allclose(end.x, FEW * np.cos(w * t) + FREE.velocities * np.sin(w * t) / w, rtol=1e-3)
+    with pytest.raises(SceneError, match=r"force must return accelerations \[m/s²\] of shape \[3, 2\], got \[2\]"):
+        sph.begin(replace(model, force=lambda s: s.x[0]), sph.make_state(FREE))
+
+
+def test_particles_that_leave_are_gone_and_counted(tmp_path):
+    """One of three goes over the border; another one enters later."""
+    scene = replace(FREE, outflow=sph.Tank((-1.0, -1.0), (0.3, 30.0)), enters=np.array([0.0, 0.8, 0.0]))
+    scene = replace(scene, positions=FEW * [0.5, 1.0], duration=1.0)
+    end = sph.run(scene, tmp_path, sph.How(frames=10, pictures=False))
+    table = np.genfromtxt(tmp_path / "energies.csv", delimiter=",", names=True)
+    np.testing.assert_array_equal(table["mass_in"], [5.0] * 8 + [7.0] * 3)
+    np.testing.assert_array_equal(table["mass_out"], [0.0] * 4 + [1.0] * 5 + [3.0] * 2)  # 1 kg at 0.3 s, 2 kg at once
+    np.testing.assert_array_equal(table["mass"], table["mass_in"] - table["mass_out"])
+    np.testing.assert_array_equal(end.gone, [True, True, False])
+    np.testing.assert_allclose(end.x[0, 0], 0.31, atol=0.011)  # it rests where it left
+    assert table["kinetic"][-1] == pytest.approx(2.0)
+    model = sph.make_model(scene)
+    np.testing.assert_array_equal(mass_there(model, end), [0.0, 0.0, 4.0])
+
+
+def test_probes_of_a_lattice():
+    """Pressures, a flow and a height that are known of a lattice that moves as one."""
+    dx = 0.1
+    x = sph.lattice((0.0, 0.0), (10, 10), dx)
+    scene = replace(FREE, positions=x, velocities=x * 0 + [3.0, 4.0], masses=np.full(100, 2 * dx**2))
+    scene = replace(scene, physics=replace(FREE.physics, density=2.0, state="linear"), densities=2.0 + 0.01 * x[:, 1])
+    model, s = sph.make_model(scene, backend="brute"), sph.make_state(scene)
+    np.testing.assert_allclose(sph.pressure_at([(0.5, 0.5), (9.0, 9.0)])(model, s), [0.005, 0.0], atol=1e-6)
+    assert sph.flow_through((0.5, 0.0), (2.0, 0.0), 4 * dx)(model, s) == pytest.approx(2 * 1.0 * 3.0)
+    assert sph.surface_height((0.5,), 2 * dx)(model, s) == pytest.approx(0.95)
+    force = sph.force_on_walls((0.0, 1.0))(replace(model, force=lambda s: s.x), s._replace(a=s.x - jnp.asarray([1.0, 0.0])))
+    np.testing.assert_allclose(force["force"], [2.0, 0.0], atol=1e-12)  # what holds the fluid back is pushed on
+    assert force["torque"] == pytest.approx(1.0)
+    with pytest.raises(SceneError, match=r"points must have shape \[k, 2\], got \[2\]"):
+        sph.pressure_at((0.5, 0.5))(model, s)
+
+
+def test_a_run_goes_on_for_longer_and_writes_a_table(tmp_path):
+    short, longer = sph.How(frames=1, lines=2, pictures=False), sph.How(frames=2, lines=2, pictures=False)
+    scene, probes = replace(FREE, duration=0.1), {"own": lambda model, s: {"far": s.x[1], "time": s.time}}
+    sph.run(scene, tmp_path / "a", short, probes=probes)
+    sph.run(replace(scene, duration=0.2), tmp_path / "a", longer, probes=probes)
+    sph.run(replace(scene, duration=0.2), tmp_path / "b", longer, probes=probes)
+    for name in ("energies.csv", "probes.csv"):
+        assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
+    table = np.genfromtxt(tmp_path / "a" / "probes.csv", delimiter=",", names=True)
+    assert table.dtype.names == ("step", "time", "own_far_0", "own_far_1", "own_time")
+    np.testing.assert_allclose(table["own_time"], [0, 0.05, 0.1, 0.15, 0.2])
+    assert json.loads((tmp_path / "a" / "run.json").read_text())["duration"] == 0.2
+    with pytest.raises(SceneError, match="holds a run with another duration, frames"):
+        sph.run(replace(scene, duration=0.3), tmp_path / "a", short, probes=probes)
