@@ -101,7 +101,8 @@ class DeviceRow(TimedRow):
     # Particles whose number of neighbors is another on one device; of a fluid those that are elsewhere after `steps`, by more than
     # a hundredth of a spacing, or were at any other place when it began.
     differing: int | None = None
-    # Rows up to version 4df7264 have it: each GPU in one run, from its first kernel to its last [s], at work [s], its longest kernels.
+    # Rows up to version 4df7264 have it: of each GPU in one run, the time from its first kernel to its last [s], how long
+    # kernels were at work [s], and the longest of them.
     busy: list[dict[str, Any]] | None = None
 
 
