@@ -35,7 +35,6 @@ class Bench(_commands.Commands):
             "crystals": "Time batches of crystals in cells of their own.",
             "distributed": "Time lists, sums and fluids on 1 to k devices.",
             "domain": "Time what empty space costs.",
-            "house": "Count files, lines and floors.",
             "arrays": "Time the array engine beside jax-md.",
             "latency": "Time calls for few particles.",
             "lj": "Time a Lennard-Jones liquid, beside jax-md's.",

@@ -7,7 +7,7 @@ from datetime import UTC, datetime
 from typing import Any, Generic
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from experiments import _machine
 from experiments._rows import RETRIED, RowFile, RowT
@@ -35,8 +35,8 @@ class Shown:
 
 @contextmanager
 def show(total: int, completed: int = 0) -> Iterator[Shown]:
-    """Show a bar on stderr."""
-    columns = (BarColumn(16), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("{task.description}"))
+    """Show a bar on stderr, with the time that has passed and, from the pace of the rows so far, the time that is left."""
+    columns = (BarColumn(16), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn(), TextColumn("{task.description}"))
     with Progress(*columns, console=Console(stderr=True, force_jupyter=False), disable=total == 0) as progress:
         yield Shown(progress, total, completed)
 
@@ -65,7 +65,7 @@ def fill(
     *,
     retry_failed: bool = False,
     about: dict[str, Any] | None = None,
-    begin: Callable[[list[Task[RowT]], list[RowT], Shown], None] = lambda left, there, shown: None,
+    begin: Callable[[list[Task[RowT]], Shown], None] = lambda left, shown: None,
 ) -> list[RowT]:
     """Measure what a file does not hold yet, and return the rows of all tasks.
 
@@ -75,7 +75,7 @@ def fill(
         describe: Returns a row as a line for the reader; None: nothing is said.
         retry_failed: Whether rows that are missing, failed or ran out of time are measured again.
         about: What else all new rows say, as far as they do not say it themselves.
-        begin: Is told what is left to measure, and which rows are there.
+        begin: Is told what is left to measure.
 
     Raises:
         UsageError: Another process fills this file, or a line of it is no row.
@@ -89,7 +89,7 @@ def fill(
         with show(total, total - missing) as shown:
             if missing < total:
                 shown.say(f"{total - missing} of {total} rows are there already")
-            begin(left, list(there.values()), shown)
+            begin(left, shown)
             for task in left:
                 _measure(task, file, describe, told, shown)
         place = {key: number for number, key in enumerate(key for task in tasks for key in task.keys)}

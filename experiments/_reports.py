@@ -7,7 +7,7 @@ from typing import Any
 
 import typer
 
-from experiments._rows import RowFile, SearchRow
+from experiments._rows import RowFile, SearchRow, read_text
 
 _KINDS = (  # columns by which rows are known, the module of their kind and its name, and that of their report
     ({"figures", "curves"}, "sph.validate", "CaseRow", "sph.validate"),
@@ -39,8 +39,7 @@ def report(folder: Path) -> None:
 def _columns(path: Path) -> set[str]:
     """Return what the first row has; nothing where it is no row."""
     try:
-        with path.open(encoding="utf-8") as stream:
-            row = json.loads(stream.readline())
+        row = json.loads(read_text(path).partition("\n")[0])
     except (OSError, ValueError):
         return set()
     return set(row) if isinstance(row, dict) else set()

@@ -1,6 +1,7 @@
 """Rows: what one measurement says, and the file that they are kept in, one JSON line each."""
 
 import fcntl
+import gzip
 import json
 import os
 from collections.abc import Iterator
@@ -139,7 +140,8 @@ def values_of(row: Any) -> dict[str, Any]:  # noqa: ANN401
 class RowFile(Generic[RowT]):
     """Rows of one kind in DIR/rows.jsonl: dataclasses, whose fields are the columns, or dicts, which have any.
 
-    Whatever was written before a kill stays; half a last line is cut off.
+    Whatever was written before a kill stays; half a last line is cut off. Rows that are done with may be packed by
+    `gzip -9n DIR/rows.jsonl`: they are read from rows.jsonl.gz, before those of rows.jsonl, and new ones go to the latter.
     """
 
     def __init__(self, folder: Path, kind: type[RowT] = SearchRow) -> None:
@@ -203,12 +205,10 @@ class RowFile(Generic[RowT]):
         Raises:
             UsageError: A line is no row.
         """
-        if not self.path.exists():
-            return []
         kind: Any = self._kind
         known = None if kind is dict else {item.name for item in fields(kind)}
         rows: list[Any] = []
-        lines = self.path.read_text(encoding="utf-8", errors="replace").split("\n")  # what is no text is no row, and is named
+        lines = read_text(self.path).split("\n")
         for number, line in enumerate(lines, start=1):
             try:
                 values = json.loads(line)
@@ -217,6 +217,15 @@ class RowFile(Generic[RowT]):
                 if number < len(lines):  # what follows the last line feed is empty, or what a kill left
                     raise UsageError(f"{self.path}: line {number} is no row ({error}): repair or remove that line") from error
         return rows
+
+
+def read_text(path: Path) -> str:
+    """Return what is packed beside a file (as PATH.gz), and then what the file holds; nothing where there is neither."""
+    packed = path.with_name(f"{path.name}.gz")
+    data = gzip.decompress(packed.read_bytes()) if packed.exists() else b""
+    if path.exists():
+        data += path.read_bytes()
+    return data.decode("utf-8", errors="replace")  # bytes that are no text make a line that is no row, and is named
 
 
 def _key(row: Any, number: int) -> Any:  # noqa: ANN401

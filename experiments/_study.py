@@ -32,8 +32,8 @@ def rows(sweep: str, small: bool, results: str | None = None) -> list[SearchRow]
         results: Folder below experiments/results; without it, that of the name.
     """
     folder = ROOT / "results" / (results or sweep)
-    if not small and (folder / "rows.jsonl").exists():
-        return read_latest(folder)
+    if not small and (there := read_latest(folder)):
+        return there
     if small:
         return list(_measure(sweep))
     config = shrink(_config.load(ROOT / "configs" / f"{sweep}.toml"))

@@ -11,13 +11,11 @@ from collections.abc import Iterable, Iterator
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from time import perf_counter
 from typing import Any
 
 from experiments import methods
 from experiments._config import Config, Spec, digest
 from experiments._errors import UsageError
-from experiments._forecast import Forecast, in_words
 from experiments._loop import Shown, Task, fill
 from experiments._rows import RETRIED, SCENE_FIELDS, RowFile, SearchRow
 from experiments._worker import RUNNER
@@ -53,36 +51,32 @@ def shard_specs(specs: Iterable[Spec], shard: tuple[int, int]) -> list[Spec]:
 
 
 class _Sweep:
-    """What a sweep knows while it runs: how long it will take, which scene is measured, and which methods are not there."""
+    """What a sweep knows while it runs: which scene is measured, and which methods are not there."""
 
     def __init__(self, folder: Path) -> None:
         self.folder, self.tasks = folder, {}
         self._scene, self._prepared, self._absent = None, set(), {}
 
-    def begin(self, left: list[Task[SearchRow]], there: list[SearchRow], shown: Shown) -> None:
-        """Say what is there, what is not installed, and how long the rest will take."""
+    def begin(self, left: list[Task[SearchRow]], shown: Shown) -> None:
+        """Say what is not installed."""
         self.pending = [self.tasks[task.keys[0]][0] for task in left]
-        self.done, self.forecast = 0, Forecast(self.pending, there)
-        if absent := self.forecast.absent:
+        self.done = 0
+        if absent := [name for name in dict.fromkeys(spec.method for spec in self.pending) if methods.lacks(name)]:
             count = sum(spec.method in absent for spec in self.pending)
             names = f"{', '.join(absent)} ({methods.HOW_TO_INSTALL})"
             shown.say(f"not installed, so that {count} rows will have no figures: {names}")
-        if left:
-            shown.say(f"{len(left)} rows to measure: {in_words(self.forecast.left(self.pending))}")
 
     def measure(self, spec: Spec, shown: Shown) -> Iterator[SearchRow]:
         """Measure a row in a process of its own."""
-        begin, left = perf_counter(), f"left: {in_words(self.forecast.left(self.pending[self.done :]))}"
         if spec.scene_key != self._scene:
             self._scene = spec.scene_key
-            shown.say(f"{spec.scene_name}: {self.done} of {len(self.pending)} rows measured, {left}")
+            shown.say(f"{spec.scene_name}: {self.done} of {len(self.pending)} rows measured")
         if spec.scene_key not in self._prepared:
             self._prepared.add(spec.scene_key)
-            shown.label(f"{left} · {spec.scene_name} · exact pairs")
+            shown.label(f"{spec.scene_name} · exact pairs")
             _prepare_oracle(spec, self.folder, shown)
-        shown.label(f"{left} · {spec.scene_name} · {spec.method}")
+        shown.label(f"{spec.scene_name} · {spec.method}")
         row = measure(spec, self.folder, self._absent.get(spec.method))
-        self.forecast.note(spec, perf_counter() - begin)
         self.done += 1
         yield row
 

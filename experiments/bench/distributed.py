@@ -25,7 +25,6 @@ from experiments._commands import RetryFailed, RowsFolder, take_folder
 from experiments._config import Dtype, Keyed, Positive, Table, load
 from experiments._loop import Task, fill
 from experiments._rows import RowFile, TimedRow
-from experiments.bench import trace
 from jfrnn import distributed
 
 _SENDS = re.compile(r"= (.*?) collective-permute(?:-start)?\((.*?)\),.*?source_target_pairs=\{(.*?)\}\}")
@@ -102,7 +101,9 @@ class DeviceRow(TimedRow):
     # Particles whose number of neighbors is another on one device; of a fluid those that are elsewhere after `steps`, by more than
     # a hundredth of a spacing, or were at any other place when it began.
     differing: int | None = None
-    busy: list[dict[str, Any]] | None = None  # in one run of a list or sum, all `steps` of a fluid: `trace.Busy` of each GPU
+    # Rows up to version 4df7264 have it: of each GPU in one run, the time from its first kernel to its last [s], how long
+    # kernels were at work [s], and the longest of them.
+    busy: list[dict[str, Any]] | None = None
 
 
 def prepare(config: Config) -> None:
@@ -248,7 +249,6 @@ def _time(work: Callable[[Any], Any], given: Any, per: int, spec: Spec, row: Dev
     timed = _time_repeats(lambda: work(given), spec)
     row.median_s, row.p10_s, row.p90_s = (timed[name] / per for name in ("median_s", "p10_s", "p90_s"))
     row.repeats = timed["repeats"]
-    row.busy = [device._asdict() for device in trace.of_run(lambda: work(given))] or None
 
 
 def sent_bytes(program: str) -> int:

@@ -16,7 +16,7 @@ import jfrnn
 from experiments import _machine, _measure
 from experiments._commands import MOST_POINTS
 from experiments._library import round_capacity
-from experiments.bench import table, together
+from experiments.bench import table
 
 SIZES = (16, 64, 256, 1000, 4096, 32768)
 MOST_ON_CPU = 4096  # particles, unless sizes are asked for
@@ -85,22 +85,13 @@ def command(
     out: Annotated[Path, typer.Option(help="Folder of the table, one file per platform.")] = Path("out") / "latency",
     sizes: Sizes = None,
     repeats: Annotated[int, typer.Option(min=2, max=100_000, help="Waited calls of each; scans are a twentieth as many.")] = 200,
-    at_once: Annotated[
-        bool, typer.Option("--at-once", help="Time searches by four threads and by four processes instead.")
-    ] = False,
 ) -> str:
     """Time calls and steps of a scan for few particles: `x + 1`, jfrnn, and jax-md and nvalchemi where they are installed.
 
     Points are random in the unit cube, float32, with about 30 neighbors. A call is waited for [µs]. A step of a compiled scan moves
     the particles and does the same, "x + 1" nothing else. Ratios are to "x + 1". Of ways whose answers are wrong, no time is taken.
-
-    With `--at-once`, four threads call four compiled searches of a process each, or one thread in each of four processes does:
-    calls per second of all together, for 1000 and 20 000 particles unless sizes are said; ratios are to four processes.
     """
     platform = jax.default_backend()
-    if at_once:
-        parts = [(f"{n} particles at once", functools.partial(together.make_rows, n)) for n in sizes or together.SIZES]
-        return table.text(table.measure(out, f"{platform}_at_once", parts, None, together.COLUMNS), together.SHOWN)
     asked = sizes or [n for n in SIZES if platform != "cpu" or n <= MOST_ON_CPU]
     parts = [(f"{n} particles", functools.partial(_rows, n, repeats)) for n in asked]
     frame = table.measure(out, platform, parts, [repeats, table.installed(_ways())], COLUMNS)

@@ -16,7 +16,7 @@ from jax import Array
 import jfrnn
 from experiments import _machine, _measure, methods
 from experiments._commands import MOST_POINTS
-from experiments.bench import table, trace
+from experiments.bench import table
 
 DENSITY, TEMPERATURE, STEP = 0.8442, 1.44, 0.005  # in units of the potential, as in the benchmark of LAMMPS
 ONSET, CUTOFF = 2.0, 2.5  # between which the potential goes to 0 smoothly, as that of jax-md does
@@ -25,10 +25,10 @@ STEPS = {4096: 1000, 32_768: 500, 1_000_000: 200}  # of a scan on a GPU; on the 
 MOST_ON_CPU = 32_768  # particles, unless sizes are asked for
 JAX_MD = {"jax-md dense": "Dense", "jax-md ordered sparse": "OrderedSparse"}  # formats of its lists
 COLUMNS = (
-    *("platform", "n", "who", "skin", "skins", "steps", "steps_per_s", "busy_us", "ratio", "neighbors", "rebuilds", "drift"),
+    *("platform", "n", "who", "skin", "skins", "steps", "steps_per_s", "ratio", "neighbors", "rebuilds", "drift"),
     *("temperature", "backend", "repeats", "status", "reason", "others_cores", "device", "jax", "warp", "peer", "commit", "dirty"),
 )
-SHOWN = ("n", "who", "skin", "steps", "steps_per_s", "busy_us", "ratio", "neighbors", "rebuilds", "drift", "temperature", "reason")
+SHOWN = ("n", "who", "skin", "steps", "steps_per_s", "ratio", "neighbors", "rebuilds", "drift", "temperature", "reason")
 
 Sizes = Annotated[list[int] | None, typer.Option(min=64, max=MOST_POINTS, help="Numbers of particles; may be said several times.")]
 Potential = Callable[[Array, Any], Array]  # of positions and what a way keeps; per particle
@@ -64,14 +64,13 @@ class _Way(NamedTuple):
 
 
 class _Run(NamedTuple):
-    """What a scan ends with, and what runs it again."""
+    """What a scan ends with."""
 
     seconds: float
     x: Array
     v: Array
     kept: Any
     drift: float
-    again: Callable[[], Any]
 
 
 # --- the command ------------------------------------------------------------------------------------------------------
@@ -86,8 +85,7 @@ def command(
     """Time a Lennard-Jones liquid (NVE, float32) by `pair_sum`, over a kept list, by distances, and by jax-md's `simulate.nve`.
 
     The skin is the one with which `pair_sum` over a list makes most steps; all lists have it. `drift` is how much the energy per
-    particle changes in a scan, in units of the potential; ratios are to the fastest of jax-md, where it is installed. `busy_us` is
-    how long kernels of a GPU are at work in a step, by JAX's profiler in a run of its own.
+    particle changes in a scan, in units of the potential; ratios are to the fastest of jax-md, where it is installed.
     """
     platform = jax.default_backend()
     asked = sizes or [n for n in STEPS if platform != "cpu" or n <= MOST_ON_CPU]
@@ -132,7 +130,6 @@ def _row(name: str, liquid: _Liquid, skin: float, steps: int, repeats: int) -> t
         "who": name,
         "status": "ok",
         "steps_per_s": steps / done.seconds,
-        "busy_us": _busy_us(done.again, steps),
         "drift": done.drift,
         "temperature": _temperature(done.v),
     }
@@ -220,14 +217,7 @@ def _run(way: _Way, liquid: _Liquid, skin: float, steps: int, repeats: int) -> _
         end.check()
     before, after = (_total(energy(at, held), speed) for at, held, speed in ((liquid.x, kept, liquid.v), (x, end, v)))
     drift = (after - before) / len(x)
-    return _Run(_measure.summarize(seconds)["median_s"], x, v, end, drift, lambda: scan(liquid.x, liquid.v, kept))
-
-
-def _busy_us(run: Callable[[], Any], steps: int) -> float | None:
-    """Return for how many microseconds of a step kernels and copies are at work on a GPU."""
-    if jax.default_backend() == "cpu":
-        return None
-    return 1e6 * sum(device.busy_s for device in trace.of_run(run)) / steps
+    return _Run(_measure.summarize(seconds)["median_s"], x, v, end, drift)
 
 
 def _total(potential: Array, v: Array) -> float:
@@ -279,5 +269,4 @@ def _run_jax_md(form: str, liquid: _Liquid, skin: float, steps: int, repeats: in
     kinetic = [np.sum(np.square(np.asarray(at.momentum, np.float64))) / 2 for at in (state, end)]
     drift = (of_all[1] + kinetic[1] - of_all[0] - kinetic[0]) / len(wrapped)
     seconds = _measure.summarize(seconds)["median_s"]
-    found = {"steps_per_s": steps / seconds, "drift": float(drift), "temperature": _temperature(end.momentum)}
-    return found | {"busy_us": _busy_us(lambda: scan(state, nbrs), steps)}
+    return {"steps_per_s": steps / seconds, "drift": float(drift), "temperature": _temperature(end.momentum)}

@@ -7,7 +7,7 @@ from typer.testing import CliRunner
 
 from experiments import methods
 from experiments._cli import app
-from experiments.bench import latency, table, together
+from experiments.bench import latency, table
 
 OURS = ["x + 1", "list", "counts", "density", "density, gradient"]
 N = 16
@@ -73,13 +73,3 @@ def test_counts_of_lists_of_others(scene):
     assert latency._wrong_rows(scene, (scene.idx[:, ::-1], scene.counts)) == 0
     moved = np.where(np.arange(N)[:, None] == 3, np.roll(scene.idx, 1, axis=0), scene.idx)
     assert latency._wrong_rows(scene, (moved, scene.counts)) == 1
-
-
-def test_searches_at_once_get_a_row_for_each_kind(monkeypatch):
-    monkeypatch.setattr(together, "SECONDS", 0.01)
-    monkeypatch.setattr(together, "REPEATS", 1)
-    monkeypatch.setattr(together, "KINDS", {"two threads": (1, 2), "four processes": (1, 1)})
-    rows = list(together.make_rows(N))
-    assert [row["what"] for row in rows] == ["two threads", "four processes"]
-    assert rows[1]["ratio"] == 1
-    assert all(row["calls_per_s"] * row["call_us"] == pytest.approx(1e6 * (2 - k)) for k, row in enumerate(rows))

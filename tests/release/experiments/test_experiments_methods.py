@@ -79,3 +79,23 @@ def test_an_adapter_says_what_it_lacks(monkeypatch):
     monkeypatch.setenv("CXX", "no-such-compiler")
     with pytest.raises(ImportError, match="no C\\+\\+ compiler: install g\\+\\+, or name one in the environment variable CXX"):
         _native.load("ann", "ANN/ANN.h", "libann-dev")
+
+
+@pytest.mark.usefixtures("foreign")
+def test_methods_that_cannot_be_imported_are_those_that_lack_something():
+    found = []
+    for name in methods.names():
+        try:
+            methods.load(name)
+        except ImportError:
+            found.append(name)
+    assert found == [name for name in methods.names() if methods.lacks(name)]
+
+
+def test_without_a_compiler_its_methods_are_said_to_lack_it(tmp_path, monkeypatch):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.delenv("CXX", raising=False)
+    methods._lacks.cache_clear()
+    said = [methods.lacks(name) for name in ("ann-kd", "scipy-kdtree")]
+    methods._lacks.cache_clear()
+    assert said == ["no C++ compiler: install g++, or name one in the environment variable CXX", None]

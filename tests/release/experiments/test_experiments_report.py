@@ -1,4 +1,5 @@
 import csv
+import gzip
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -307,12 +308,25 @@ def test_short_times_keep_three_figures():
 RESULTS = Path(_report.__file__).parent / "results"
 
 
-@pytest.mark.parametrize("path", sorted(RESULTS.rglob("*.jsonl")), ids=lambda path: f"{path.parent.name}/{path.stem}")
+@pytest.mark.parametrize("path", sorted(RESULTS.rglob("*.jsonl*")), ids=lambda path: f"{path.parent.name}/{path.stem}")
 def test_rows_of_earlier_runs_are_read_with_their_columns(tmp_path, path):
     """Every study reads the rows that are kept of it: what a row says is what is read."""
-    (tmp_path / "rows.jsonl").write_bytes(path.read_bytes())
+    packed = path.suffix == ".gz"
+    (tmp_path / f"rows.jsonl{'.gz' * packed}").write_bytes(path.read_bytes())
     kind, _ = _reports.kind_of(tmp_path)
     rows = RowFile(tmp_path, kind).read_all()
-    first, read = json.loads(path.read_text().splitlines()[0]), values_of(rows[0])
+    text = gzip.decompress(path.read_bytes()).decode() if packed else path.read_text()
+    first, read = json.loads(text.splitlines()[0]), values_of(rows[0])
     assert {name: read[name] for name in first} == first
     assert (kind is dict) == ("kind" in first and "way" not in first)
+
+
+def test_rows_that_are_packed_come_before_those_that_were_added(tmp_path):
+    file, (old, new) = RowFile(tmp_path), make_rows()[:2]
+    file.append(old)
+    (tmp_path / "rows.jsonl.gz").write_bytes(gzip.compress(file.path.read_bytes()))
+    file.path.unlink()
+    assert file.read() == [old]
+    file.append(new)
+    file.append(replace(old, median_s=7.0))
+    assert file.read() == [replace(old, median_s=7.0), new]
