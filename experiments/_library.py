@@ -22,6 +22,8 @@ from jfrnn._triangles.cells import gather_corners
 from jfrnn.cases import _fluid_flows, _fluid_free
 from jfrnn.kernels import _driver, triangles_cuda
 
+Name = Any  # one of a few words, such as a backend, as a config or a command line gives it
+
 taylor_green_velocity, free, LAYERS = _fluid_flows.taylor_green_velocity, _fluid_free.free, _fluid_free.LAYERS
 
 

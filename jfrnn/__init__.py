@@ -9,6 +9,10 @@ Array([1, 1, 0], dtype=int32)
 [[0, 1], [1, 0]]
 """
 
+import importlib
+from types import ModuleType
+from typing import TYPE_CHECKING
+
 from jfrnn._geometry import (
     Box,
     NeighborOverflowError,
@@ -25,6 +29,14 @@ from jfrnn._memory import MemoryPlan, memory_plan
 from jfrnn._search import EdgeList, NeighborList, count, run_chunk, search, search_edges
 from jfrnn._sums import pair_sum
 from jfrnn._triangles import TriangleList, search_triangles
+
+if TYPE_CHECKING:
+    from jfrnn import ase as ase
+    from jfrnn import distributed as distributed
+    from jfrnn import jax_md as jax_md
+    from jfrnn import matscipy as matscipy
+    from jfrnn import sph as sph
+    from jfrnn import vesin as vesin
 
 __version__ = "0.2.0"
 
@@ -51,3 +63,17 @@ __all__ = [
     "search_triangles",
     "sort_order",
 ]
+
+_MODULES = ("ase", "distributed", "jax_md", "matscipy", "sph", "vesin")  # imported when they are asked for
+
+
+if not TYPE_CHECKING:  # who checks types takes the names above, and finds misspelt ones
+
+    def __getattr__(name: str) -> ModuleType:
+        if name in _MODULES:
+            return importlib.import_module(f"{__name__}.{name}")
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return [*__all__, "__version__", *_MODULES]

@@ -29,7 +29,7 @@ from jfrnn._engine import (
 from jfrnn._geometry import Cutoff, check_capacity, check_cutoff, check_flag, check_kind, check_size, check_skin
 from jfrnn._search import check_total
 from jfrnn._sums import pair_sum
-from jfrnn._tracing import Tree
+from jfrnn._tracing import Flag, Given, Number, Real, Size, Tree
 from jfrnn._triangles import TRIANGLE_ENGINES, TriangleEngine, fastest_of, find_triangles
 
 Device = Any  # jax.Device, which type checkers treat as a variable
@@ -78,16 +78,16 @@ class MemoryPlan:
 
 
 def memory_plan(
-    n: int,
-    cutoff: float,
-    capacity: int | None = None,
+    n: Size,
+    cutoff: Number,
+    capacity: Size | None = None,
     *,
-    total: int | None = None,
+    total: Size | None = None,
     dim: int = 3,
     dtype: np.dtype | type | str = np.float32,
     queries: int | None = None,
-    skin: float = 0.0,
-    reverse: bool = False,
+    skin: Real = 0.0,
+    reverse: Flag = False,
     fn: Callable[[Any, Any, Any], Any] | None = None,
     values: Tree = None,
     gradient: bool = False,
@@ -158,7 +158,7 @@ def memory_plan(
     named = parse_backend(backend, ENGINES)
     if fn is not None:
         points = _shapes_of(n, queries, dim, dtype)
-        return _plan_of_sum(fn, points, cutoff, values, gradient, named, _device_of(where))
+        return _plan_of_sum(fn, points, float(cutoff), values, gradient, named, _device_of(where))
     capacity, total = None if capacity is None else check_capacity(capacity), None if total is None else check_total(total)
     chosen = named or fastest_engine(_device_of(where).platform, n)
     scratch = chosen.scratch_bytes(where, n, rows, dim, dtype == np.float64, queries is None, radius.scaled)
@@ -181,7 +181,7 @@ def memory_plan(
 
 
 def _check_parts(
-    faces: int | None, queries: int | None, fn: Callable[..., Any] | None, capacity: int | None, of_sums: bool
+    faces: int | None, queries: int | None, fn: Callable[..., Any] | None, capacity: Size | None, of_sums: bool
 ) -> None:
     """Refuse arguments that do not belong to what is planned."""
     if faces is not None and (fn is not None or queries is not None):
@@ -208,7 +208,7 @@ def _device_of(platform: str) -> Device:
 
 
 def _compiled_scratch(
-    points: list[jax.ShapeDtypeStruct | None], cutoff: Cutoff, engine: Engine, capacity: int | None, total: int | None
+    points: list[jax.ShapeDtypeStruct | None], cutoff: Cutoff, engine: Engine, capacity: Size | None, total: Size | None
 ) -> int:
     """Compile the search, or the count, for these shapes, and return XLA's size of its temporary arrays [B]."""
     options = Options(Filter(drop_self=points[1] is None, later_only=False), engine, closed=False)
@@ -252,7 +252,7 @@ def _plan_of_sum(
 ) -> MemoryPlan:
     """Compile a pair sum for sources and queries of these shapes, with the engine that "auto" means."""
 
-    def program(x: Array, queries: Array | None, values: Tree, *, backend: str) -> Tree:
+    def program(x: Array, queries: Array | None, values: Tree, *, backend: Given) -> Tree:
         def loss(x: Array) -> Tree:
             sums = pair_sum(fn, x, cutoff, values, queries=queries, backend=backend)
             floats = (leaf for leaf in jax.tree.leaves(sums) if jnp.issubdtype(leaf.dtype, jnp.floating))

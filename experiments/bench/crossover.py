@@ -12,6 +12,7 @@ import typer
 
 import jfrnn
 from experiments import _compare, _measure, _oracle
+from experiments._library import Name
 from experiments.bench import table
 from experiments.methods import Found
 
@@ -60,7 +61,7 @@ def _rows(n: int, neighbors: int, repeats: int) -> Iterator[table.Line]:
         yield row | times | {"repeats": repeats, "missing": found["missing"], "extra": found["extra"], "others_cores": others}
 
 
-def _compile(x: jax.Array, cutoff: float, capacity: int, backend: str) -> Search:
+def _compile(x: jax.Array, cutoff: float, capacity: int, backend: Name) -> Search:
     """Return a jitted search that has run twice: compiled, its kernels loaded, its memory touched."""
     search = jax.jit(lambda x: jfrnn.search(x, cutoff, capacity=capacity, backend=backend))
     for _ in range(2):

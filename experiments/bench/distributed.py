@@ -23,6 +23,7 @@ import jfrnn
 from experiments import _machine, _measure
 from experiments._commands import RetryFailed, RowsFolder, take_folder
 from experiments._config import Dtype, Keyed, Positive, Table, load
+from experiments._library import Name
 from experiments._loop import Task, fill
 from experiments._rows import RowFile, TimedRow
 from jfrnn import distributed
@@ -75,7 +76,7 @@ class Spec(Keyed):
     min_seconds: float
     steps: int
     check_most: int
-    backend: str
+    backend: Name
 
 
 @dataclass(kw_only=True)

@@ -14,7 +14,7 @@ import typer
 import jfrnn
 from experiments import _machine, _measure, methods
 from experiments._commands import Engine, Points, Rounds
-from experiments._library import round_capacity
+from experiments._library import Name, round_capacity
 from experiments.bench import table
 from experiments.bench.options_scenes import FIRST, Asked, Option, beside, density, options
 
@@ -56,7 +56,7 @@ def command(
     return table.text(table.measure(out, f"{jax.default_backend()}_{backend}", parts, given, COLUMNS), SHOWN)
 
 
-def _rows(option: Option, n: int, rounds: int, backend: str) -> Iterator[table.Line]:
+def _rows(option: Option, n: int, rounds: int, backend: Name) -> Iterator[table.Line]:
     """Yield the row of an option; medians of rounds count."""
     row: table.Line = {"backend": backend, "n": n, "option": option.name, "beside": option.beside, "status": "ok"}
     row |= {"cores": _machine.machine()["cores"], "scipy": _machine.versions()["scipy"]}
@@ -64,7 +64,7 @@ def _rows(option: Option, n: int, rounds: int, backend: str) -> Iterator[table.L
     yield row
 
 
-def _measure_option(row: table.Line, option: Option, n: int, rounds: int, backend: str) -> None:
+def _measure_option(row: table.Line, option: Option, n: int, rounds: int, backend: Name) -> None:
     asked = option.make(n)
     calls, about = _compile(asked, backend)
     row |= about | {"n": len(asked.x), "spread": asked.spread, "rounds": rounds}
@@ -84,11 +84,11 @@ def _burst() -> int:
 
 
 @functools.cache
-def _plain_calls(n: int, backend: str) -> tuple[Calls, table.Line]:
+def _plain_calls(n: int, backend: Name) -> tuple[Calls, table.Line]:
     return _compile(options()[0].make(n), backend)
 
 
-def _compile(asked: Asked, backend: str) -> tuple[Calls, table.Line]:
+def _compile(asked: Asked, backend: Name) -> tuple[Calls, table.Line]:
     """Return what lists, counts and sums a density, and entries and capacity; of half lists, and with a skin, there is no sum."""
     given = {name: value for name, value in asked.more.items() if name != "skin"} | {"cutoff": asked.cutoff}
     skin = asked.more.get("skin", 0.0)

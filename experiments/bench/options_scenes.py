@@ -34,7 +34,7 @@ class Asked(NamedTuple):
     cutoff: Any
     more: dict[str, Any]
     peers: bool = False
-    alone: Callable[[Any, Any, str], Any] | None = None
+    alone: Callable[[Any, Any, Any], Any] | None = None
 
     @property
     def spread(self) -> float | None:
@@ -115,7 +115,7 @@ def _with(name: str, n: int) -> Asked:
     return Asked(x, plain.cutoff * (_SYSTEMS ** (1 / 3) if "batch" in more else 1), more)
 
 
-def _sum_alone(make: Callable[[int], Callable[[Any, Any, str], Any]], n: int) -> Asked:
+def _sum_alone(make: Callable[[int], Callable[[Any, Any, Any], Any]], n: int) -> Asked:
     return _plain(n)._replace(alone=make(n), peers=False)
 
 
@@ -124,11 +124,11 @@ def density(r: jax.Array, i: jax.Array, j: jax.Array) -> jax.Array:
     return j * jnp.maximum(1 - r @ r, 0) ** 3
 
 
-def _largest(n: int) -> Callable[[Any, Any, str], Any]:
+def _largest(n: int) -> Callable[[Any, Any, Any], Any]:
     return lambda x, masses, backend: jfrnn.pair_sum(density, x, _radius(n), masses, reduce="max", backend=backend)
 
 
-def _by_species(n: int) -> Callable[[Any, Any, str], Any]:
+def _by_species(n: int) -> Callable[[Any, Any, Any], Any]:
     species = jnp.asarray(np.random.default_rng(1).integers(0, 2, n), jnp.int32)
     table = jnp.asarray([[1.0, 0.75], [0.75, 0.5]], jnp.float32)
 

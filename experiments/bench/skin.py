@@ -12,6 +12,7 @@ import typer
 import jfrnn
 from experiments import _layouts, _measure
 from experiments._commands import Spacing
+from experiments._library import Name
 from experiments.bench import table
 
 BACKENDS = ("warp", "jax")
@@ -30,7 +31,7 @@ def command(
     return table.text(table.measure(out, jax.default_backend(), parts, [spacing, steps, repeats], COLUMNS))
 
 
-def _rows(backend: str, spacing: float, steps: int, repeats: int) -> Iterator[table.Line]:
+def _rows(backend: Name, spacing: float, steps: int, repeats: int) -> Iterator[table.Line]:
     """Time updates inside a compiled scan over the thesis's full lattice: at rest, and moving a skin per step.
 
     What a scan copies once is shared by its steps. "jax", which takes seconds to rebuild, gets a tenth of them.

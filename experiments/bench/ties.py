@@ -18,7 +18,7 @@ from jax.typing import DTypeLike
 import jfrnn
 from experiments import _config, _layouts, _measure, _oracle
 from experiments._commands import MOST_POINTS, Engine, Rounds
-from experiments._library import round_capacity
+from experiments._library import Name, round_capacity
 from experiments.bench import table
 
 JITTER = 0.3  # of a spacing, to either side
@@ -99,7 +99,7 @@ def _place(integers: np.ndarray, dtype: DTypeLike) -> Iterator[_Sites]:
         yield _Sites(name, (sites * spacing).astype(dtype), float(np.asarray(3 * spacing, dtype)))
 
 
-def _rows(scene: str, sites: Callable[[], np.ndarray], dtype: DTypeLike, rounds: int, backend: str) -> Iterator[table.Line]:
+def _rows(scene: str, sites: Callable[[], np.ndarray], dtype: DTypeLike, rounds: int, backend: Name) -> Iterator[table.Line]:
     """Time one scene in one dtype: a row for each kind of sites; medians of rounds count."""
     placed = list(_place(sites(), dtype))
     calls = [_compile(each, backend) for each in placed]
@@ -120,7 +120,7 @@ def _rows(scene: str, sites: Callable[[], np.ndarray], dtype: DTypeLike, rounds:
         yield row | {f"{what}_ratio": round(float(value), 2) for what, value in zip(TIMED, median / medians[0], strict=True)}
 
 
-def _compile(sites: _Sites, backend: str) -> dict[str, Callable[[], Any]]:
+def _compile(sites: _Sites, backend: Name) -> dict[str, Callable[[], Any]]:
     x, r = jnp.asarray(sites.positions), sites.cutoff
     count = jax.jit(lambda x: jfrnn.count(x, r, backend=backend))
     capacity = round_capacity(int(np.asarray(count(x)).max()))

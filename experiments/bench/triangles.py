@@ -15,6 +15,7 @@ import typer
 import jfrnn
 from experiments import _machine, _measure
 from experiments._commands import Points, Rounds, check_choice, positive
+from experiments._library import Name
 from experiments.bench import table
 from jfrnn.cases import meshes
 
@@ -67,14 +68,14 @@ def command(
     return table.text(table.measure(out, f"{jax.default_backend()}_{backend}", parts, given, COLUMNS), SHOWN)
 
 
-def _gear_rows(n: int, faces: int, cutoffs: list[float], rounds: int, backend: str) -> Iterator[table.Line]:
+def _gear_rows(n: int, faces: int, cutoffs: list[float], rounds: int, backend: Name) -> Iterator[table.Line]:
     scene = gear(n, faces)
     peers = {name: peer(scene) for name, peer in _PEERS.items() if importlib.util.find_spec(_MODULES[name])}
     for cutoff in cutoffs:
         yield from _rows(scene, cutoff, rounds, backend, peers)
 
 
-def _rows(scene: _Scene, cutoff: float, rounds: int, backend: str, peers: dict[str, _Asked]) -> Iterator[dict[str, Any]]:
+def _rows(scene: _Scene, cutoff: float, rounds: int, backend: Name, peers: dict[str, _Asked]) -> Iterator[dict[str, Any]]:
     engines = (backend, "bvh") if backend == "warp" else (backend,)
     lists = {engine: _calls(scene, cutoff, engine) for engine in engines}
     calls = {f"{engine} {way}": call for engine, (calls, _) in lists.items() for way, call in calls.items()}
@@ -105,7 +106,7 @@ def gear(n: int, faces: int) -> _Scene:
     return _Scene(np.random.default_rng(0).uniform(low, high, (n, 3)).astype(np.float32), vertices, named)
 
 
-def _calls(scene: _Scene, cutoff: float, backend: str) -> tuple[dict[str, Callable[[], Any]], jfrnn.TriangleList]:
+def _calls(scene: _Scene, cutoff: float, backend: Name) -> tuple[dict[str, Callable[[], Any]], jfrnn.TriangleList]:
     x, vertices = jnp.asarray(scene.points), jnp.asarray(scene.vertices)
     tri = jfrnn.search_triangles(x, vertices, jnp.asarray(scene.faces), cutoff, backend=backend)
     update = jax.jit(lambda x, tri: tri.update(x))

@@ -13,10 +13,10 @@ import typer
 import jfrnn
 from experiments import _measure
 from experiments._commands import Points, Rounds
-from experiments._library import round_capacity
+from experiments._library import Name, round_capacity
 from experiments.bench import table
 
-ORDERS = ("random", "row", "morton", "hilbert")
+ORDERS: tuple[Name, ...] = ("random", "row", "morton", "hilbert")
 CLUMPS = (0, 100, 300, 1000, 3000)  # points that lie within half a cutoff of each other
 NEIGHBORS = 30  # about so many each, away from the faces of the unit cube
 ORDER_COLUMNS = ("order", "points", "sort_ms", "search_ms", "sum_ms", "gain")

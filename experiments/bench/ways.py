@@ -13,6 +13,7 @@ import numpy as np
 
 from experiments import _layouts, _machine
 from experiments._config import Keyed
+from experiments._library import Name
 
 MOST_ROWS = 20_000  # whose error is looked at; of more particles, evenly chosen ones
 
@@ -210,7 +211,7 @@ def _compile(density: Callable[[Any, Any, Any], Any], gradient: bool) -> Callabl
     return jax.jit(both)
 
 
-def _steps_without_list(backend: str) -> Callable[[Given, bool, bool], Steps]:
+def _steps_without_list(backend: Name) -> Callable[[Given, bool, bool], Steps]:
     def prepare(given: Given, gradient: bool, compensated: bool) -> Steps:
         import jfrnn
 

@@ -56,9 +56,9 @@ def _decisions(config: Exactness, dtype: str, dim: int) -> Decisions:
         given = dict(case.options)
         for name in ("queries", "batch", "cutoff"):
             given[name] = _pad_rows(given.get(name, case.cutoff if name == "cutoff" else None), rows)
-        options: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
+        options: dict[str, Any] = {name: value for name, value in given.items() if value is not None} | {"backend": config.backend}
         x = jnp.asarray(sums.pad_points(case.positions, rows))
-        nbrs = jfrnn.search(x, **options, capacity=config.capacity, backend=config.backend)
+        nbrs = jfrnn.search(x, **options, capacity=config.capacity)
         yield case.name, found_pairs(nbrs, x, options.get("queries")) == case.expected
 
 

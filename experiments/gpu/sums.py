@@ -8,12 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 
 import jfrnn
+from experiments._library import Name
 
 COLUMNS = (1, 5, 9, 14)  # numbers of a neighbor that a term reads, besides its position
 _LARGEST = 512  # such that no sum of a row leaves the integers of float32
 
 
-def decisions(dtype: str, dim: int, capacity: int, backend: str, least_rows: int = 0) -> Iterator[tuple[str, bool]]:
+def decisions(dtype: str, dim: int, capacity: int, backend: Name, least_rows: int = 0) -> Iterator[tuple[str, bool]]:
     """Say of every scene, and of every number of columns, whether sums and counts of pairs are those of the list.
 
     Scenes of fewer rows than the least are filled up with points that are nowhere.

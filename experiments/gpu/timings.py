@@ -13,7 +13,7 @@ from jax import lax
 
 import jfrnn
 from experiments import _compare, _measure
-from experiments._library import load_warp, round_capacity
+from experiments._library import Name, load_warp, round_capacity
 from experiments.bench import ways
 from experiments.gpu.config import Config
 
@@ -75,7 +75,7 @@ def _warp_pool_bytes() -> int:
 # --- timings -------------------------------------------------------------------------------------------------------
 
 
-def _list(x: Any, *, cutoff: float, capacity: int, backend: str) -> Any:  # noqa: ANN401
+def _list(x: Any, *, cutoff: float, capacity: int, backend: Name) -> Any:  # noqa: ANN401
     nbrs = jfrnn.search(x, cutoff, capacity=capacity, backend=backend)
     return nbrs.idx, nbrs.count
 

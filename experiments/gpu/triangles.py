@@ -14,12 +14,12 @@ from jax import lax
 
 import jfrnn
 from experiments import _compare, _measure
-from experiments._library import triangle_query
+from experiments._library import Name, triangle_query
 from experiments.bench import bvh
 from experiments.bench.triangles import gear
 
 
-def decisions(oracle: Any, dtype: str, dim: int, capacity: int, backend: str) -> Iterator[tuple[str, bool]]:  # noqa: ANN401
+def decisions(oracle: Any, dtype: str, dim: int, capacity: int, backend: Name) -> Iterator[tuple[str, bool]]:  # noqa: ANN401
     """Say of every hard case whether its list is the oracle's, and its distances are as near as they are promised to be."""
     from jfrnn.cases.triangles import TRIANGLE_CASES, padded
 

@@ -7,24 +7,25 @@ import numpy as np
 
 import jfrnn
 from experiments import _compare
+from experiments._library import Name
 from experiments.methods import Found
 from experiments.methods._compiled import compile_for
 
 
-def allocate_backend(positions: np.ndarray, cutoff: float, backend: str) -> int:
+def allocate_backend(positions: np.ndarray, cutoff: float, backend: Name) -> int:
     """Count the neighbors once, and return the length of the longest row."""
     jax.config.update("jax_enable_x64", positions.dtype == np.float64)
     return int(np.asarray(jfrnn.count(jax.numpy.asarray(positions), cutoff, backend=backend)).max(initial=0))
 
 
 def prepare_backend(
-    positions: np.ndarray, cutoff: float, capacity: int, backend: str, kernels: bool = False
+    positions: np.ndarray, cutoff: float, capacity: int, backend: Name, kernels: bool = False
 ) -> Callable[[], jfrnn.NeighborList]:
     """Compile the search, and return it."""
     return compile_for(lambda x: jfrnn.search(x, cutoff, capacity=capacity, backend=backend), positions, kernels=kernels)
 
 
-def plan_backend(positions: np.ndarray, cutoff: float, capacity: int | None = None, *, backend: str) -> jfrnn.MemoryPlan:
+def plan_backend(positions: np.ndarray, cutoff: float, capacity: int | None = None, *, backend: Name) -> jfrnn.MemoryPlan:
     """Return what the search is said to take of the memory, without a capacity the count."""
     n, dim = positions.shape
     return jfrnn.memory_plan(n, cutoff, capacity, dim=dim, dtype=positions.dtype, backend=backend)

@@ -12,7 +12,7 @@ import numpy as np
 from jax import Array, lax
 from jax.core import Tracer
 
-from jfrnn._tracing import Given, at_once, compile_program, own_transfers
+from jfrnn._tracing import Given, as_array, at_once, compile_program, own_transfers
 
 Words = tuple[Array, Array]  # high and low half of a key, uint32
 _MOST_BITS = {2: 31, 3: 21}
@@ -237,6 +237,7 @@ def _unpack(keys: Array, key_bits: int) -> Words:
 
 def _check_coords(coords: Given, bits: object, default: bool = False) -> tuple[Array, int]:
     """Return checked coordinates, [..., 2] or [..., 3], and the number of bits."""
+    coords = as_array("coords", coords)
     dtype = getattr(coords, "dtype", type(coords).__name__)
     if isinstance(dtype, str) or not jnp.issubdtype(dtype, jnp.integer):
         raise TypeError(
@@ -259,6 +260,7 @@ def _check_keys(keys: Given, dim: object, bits: object, default: bool = False) -
     bits = _check_bits(bits, dim, default)
     words = dim * bits > 32 and not _wide()
     wanted = np.dtype(np.uint64 if dim * bits > 32 and not words else np.uint32)
+    keys = as_array("keys", keys)
     dtype, shape = getattr(keys, "dtype", type(keys).__name__), list(np.shape(keys))
     if dtype != wanted or (words and shape[-1:] != [2]):
         raise TypeError(

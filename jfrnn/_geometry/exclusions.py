@@ -9,7 +9,7 @@ import numpy as np
 from jax import Array
 from jax.core import Tracer
 
-from jfrnn._tracing import Given, gather, on_device, own_transfers
+from jfrnn._tracing import Given, IndexRows, as_array, gather, on_device, own_transfers
 
 _ArrayModule = Any  # numpy or jax.numpy
 
@@ -57,6 +57,7 @@ def check_exclusions(exclude: Given, positions: Array, asking: Array | None) -> 
     """Return pairs [e, 2], or images [e, 2 + d], as rows, or None if there are none; those that hold a -1 count as padding."""
     sources, queries = positions.shape[0], None if asking is None else asking.shape[0]
     dim = positions.shape[1]
+    exclude = as_array("exclude", exclude)
     if not hasattr(exclude, "dtype") or not np.issubdtype(exclude.dtype, np.integer):
         told = np.dtype(exclude.dtype) if hasattr(exclude, "dtype") else type(exclude).__name__
         raise TypeError(f"exclude must be an array of integers, the numbers of two particles in each row, got {told}.")
@@ -126,7 +127,7 @@ def _sort_rows(xp: _ArrayModule, used: Given, rows: Given, others: Given, shifts
     return ExcludedRows(starts, others[order], None if shifts is None else shifts[order])
 
 
-def pairs_of_rows(rows: Array) -> Array:
+def pairs_of_rows(rows: IndexRows) -> Array:
     """Write rows of partners, one for each particle, as pairs, as `exclude` of `jfrnn.search` takes them.
 
     Args:
@@ -144,9 +145,10 @@ def pairs_of_rows(rows: Array) -> Array:
     >>> jfrnn.pairs_of_rows(np.array([[1, 2], [-1, -1], [-1, -1]])).tolist()
     [[0, 1], [0, 2], [1, -1], [1, -1], [2, -1], [2, -1]]
     """
-    if not hasattr(rows, "dtype") or not np.issubdtype(rows.dtype, np.signedinteger) or len(rows.shape) != 2:
-        told = f"{rows.dtype} of shape {list(rows.shape)}" if hasattr(rows, "dtype") else type(rows).__name__
+    given: Given = as_array("rows", rows)
+    if not hasattr(given, "dtype") or not np.issubdtype(given.dtype, np.signedinteger) or len(given.shape) != 2:
+        told = f"{given.dtype} of shape {list(given.shape)}" if hasattr(given, "dtype") else type(given).__name__
         raise TypeError(f"rows must be signed integers of shape [n, k], got {told}.")
-    xp = jnp if isinstance(rows, Array) else np
-    own = xp.broadcast_to(xp.arange(rows.shape[0], dtype=rows.dtype)[:, None], rows.shape)
-    return xp.stack([own, rows], axis=-1).reshape(-1, 2)
+    xp: Any = jnp if isinstance(given, Array) else np
+    own = xp.broadcast_to(xp.arange(given.shape[0], dtype=given.dtype)[:, None], given.shape)
+    return xp.stack([own, given], axis=-1).reshape(-1, 2)

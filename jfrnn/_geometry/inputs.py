@@ -13,7 +13,7 @@ from jax.core import Tracer
 from jfrnn._geometry.batch import Batch
 from jfrnn._geometry.box import Box
 from jfrnn._geometry.cutoffs import RULES, SUM, TABLE, Cutoff, Radii, is_radius, largest_cutoff, make_cutoff, smallest_cutoff
-from jfrnn._tracing import Given, gather, make_on_host, on_device, refuse_forks
+from jfrnn._tracing import Given, as_array, default_float, gather, make_on_host, on_device, refuse_forks
 
 _MOST_POINTS = 2**31 - 32
 _MOST_KINDS = 2**12  # places in a table of their cutoffs are whole floats, too
@@ -27,6 +27,7 @@ def check_positions(name: str, positions: Given, like: Array | None = None) -> A
             f"{name} must be a JAX or NumPy array of shape [n, 2] or [n, 3], got {type(positions).__name__}, which has one: pass "
             f"atoms.positions, with a cell box=jfrnn.Box(atoms.cell[:], periodic=atoms.pbc), or call jfrnn.ase.neighbor_list."
         )
+    positions = as_array(name, positions, default_float() if like is None else np.dtype(like.dtype))
     if not hasattr(positions, "dtype") or not hasattr(positions, "shape"):
         raise TypeError(
             f"{name} must be a JAX or NumPy array of shape [n, 2] or [n, 3], got {type(positions).__name__}: "
@@ -66,7 +67,7 @@ def check_is_known(name: str, shape: tuple[Any, ...]) -> None:
 
 def check_again(name: str, positions: Given, dtype: np.dtype, dim: int, rows: int, what: str = "the list") -> Array:
     """Return positions, after checking that they have the dtype, dimension and number that e.g. a list was made for."""
-    points = check_positions(name, positions)
+    points = check_positions(name, as_array(name, positions, np.dtype(dtype)))
     if (points.dtype, points.shape[1]) != (dtype, dim):
         raise ValueError(
             f"{name} must be {dtype} with {dim} columns, for which {what} was made, got {points.dtype} with {points.shape[1]} "
@@ -148,6 +149,7 @@ def check_radii(cutoff: Given, rule: object, sources: Array, queries: Array | No
 
 
 def _check_radii_of(name: str, radii: Given, size: int, what: str, like: Array, doubled: bool = False) -> Array:
+    radii = as_array(name, radii, np.dtype(like.dtype))
     if not hasattr(radii, "dtype") or not np.issubdtype(radii.dtype, np.floating):
         raise TypeError(f"{name} must be a number, or an array of floats with one per {what}, got {_describe_array(radii)}.")
     if tuple(radii.shape) != (size,):
@@ -181,6 +183,7 @@ def check_species(cutoff: Given, species: Given, rule: object, sources: Array, q
 
 def check_table(cutoff: Given, like: Array, kinds: int | None = None) -> Array:
     """Return cutoffs of pairs of species, [s, s], in the dtype of the positions; `kinds` is s, where it is known."""
+    cutoff = as_array("cutoff", cutoff, np.dtype(like.dtype))
     if not hasattr(cutoff, "dtype") or not np.issubdtype(cutoff.dtype, np.floating) or len(cutoff.shape) != 2:
         raise TypeError(
             "cutoff must be an array of floats of shape [s, s], the cutoffs of pairs of s species, where species is given, got "
@@ -255,6 +258,7 @@ def check_skin(skin: object, cutoff: float, dtype: np.dtype) -> float:
 
 def check_active(active: Given, positions: Array) -> Array:
     """Return the mask of active particles, [n] bool."""
+    active = as_array("active", active)
     if not hasattr(active, "dtype") or np.dtype(active.dtype) != np.bool_:
         raise TypeError(f"active must be an array of bool, one per particle, got {_describe_array(active)}.")
     if tuple(active.shape) != positions.shape[:1]:
@@ -285,6 +289,7 @@ def _check_numbers(name: str, of: str, systems: Given, size: int, what: str) -> 
 
     Traced integers that are wider are taken; the largest int32 stands for those that do not fit.
     """
+    systems = as_array(name, systems)
     if not hasattr(systems, "dtype") or not np.issubdtype(systems.dtype, np.integer):
         raise TypeError(f"{name} must be an array of integers, the {of} of each {what}, got {_describe_array(systems)}.")
     if tuple(systems.shape) != (size,):

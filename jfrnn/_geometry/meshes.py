@@ -5,10 +5,10 @@ import numpy as np
 from jax import Array
 from jax.core import Tracer
 
-from jfrnn._tracing import Given, on_device, own_transfers
+from jfrnn._tracing import Given, IndexRows, Points, as_array, default_float, on_device, own_transfers
 
 
-def merge_vertices(vertices: Array, faces: Array) -> tuple[Array, Array]:
+def merge_vertices(vertices: Points, faces: IndexRows) -> tuple[Array, Array]:
     """Join coincident vertices, so that triangles stored separately, as in STL files, share sides and corners.
 
     `TriangleList.signed_distance` and `contacts` recognize adjacent triangles by common vertex numbers. Vertices coincide if all
@@ -52,7 +52,8 @@ def merge_vertices(vertices: Array, faces: Array) -> tuple[Array, Array]:
 
 
 def _check_mesh(vertices: Given, faces: Given) -> tuple[np.ndarray, np.ndarray]:
-    points, named = np.asarray(jax.device_get(vertices)), np.asarray(jax.device_get(faces))
+    points = np.asarray(jax.device_get(as_array("vertices", vertices, default_float())))
+    named = np.asarray(jax.device_get(as_array("faces", faces)))
     if points.dtype not in (np.float32, np.float64):
         raise TypeError(f"vertices must be float32 or float64, got {points.dtype}.")
     if points.ndim != 2 or points.shape[1] not in (2, 3):

@@ -3,6 +3,7 @@
 import functools
 from collections.abc import Callable
 from numbers import Real
+from typing import Literal
 
 import jax.numpy as jnp
 import numpy as np
@@ -11,7 +12,7 @@ from jax.core import Tracer
 
 from jfrnn._geometry.curves import Words, hilbert_words, morton_words
 from jfrnn._geometry.inputs import check_positions
-from jfrnn._tracing import Given, compile_program, on_device, own_transfers
+from jfrnn._tracing import Given, Number, Points, compile_program, on_device, own_transfers
 
 _SORT_BITS = 21  # bits per axis, fewer than the 24 up to which float32 holds cell numbers exactly
 _LAYOUT = {np.dtype(np.float32): (np.int32, 23, 127), np.dtype(np.float64): (np.int64, 52, 1023)}  # type, mantissa bits, bias
@@ -19,7 +20,7 @@ _NO_CELL = np.uint32(2**32 - 1)  # sorts last, as no key has such a high word
 _DISTINCT = 100  # from 2^100 cells on, neighboring floats are more than 2^21 cells apart, in float64 too
 
 
-def sort_order(positions: Array, cell_size: float, *, curve: str = "hilbert") -> Array:
+def sort_order(positions: Points, cell_size: Number, *, curve: Literal["hilbert", "morton", "row"] = "hilbert") -> Array:
     """Order particles by their cells along a curve, so that `positions[order]` has neighbors in space close in memory.
 
     The cell of a particle is floor(x / cell_size), with the quotient as the dtype rounds it; cells are counted from the lowest

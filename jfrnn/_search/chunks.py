@@ -10,7 +10,7 @@ from jax.core import Tracer
 
 from jfrnn._geometry import Box
 from jfrnn._search.kept_search import Kept, KeptSearch
-from jfrnn._tracing import own_transfers
+from jfrnn._tracing import Real, own_transfers
 
 State = TypeVar("State")
 
@@ -25,7 +25,7 @@ def run_chunk(
     active: Callable[[State], Array] | None = None,
     box: Callable[[State], Box] | None = None,
     cutoff: Callable[[State], Array] | None = None,
-    slack: float = 1.25,
+    slack: Real = 1.25,
 ) -> tuple[State, Kept]:
     """Run a jitted chunk of steps; if its list overflowed, grow the list and replay the chunk from the same state.
 

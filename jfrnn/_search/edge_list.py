@@ -17,7 +17,7 @@ from jfrnn._search.kept_search import KeptSearch
 from jfrnn._search.making import find_flat_fields
 from jfrnn._search.reverse import Reverse
 from jfrnn._search.topology import Topology
-from jfrnn._tracing import at_once, own_transfers
+from jfrnn._tracing import Points, Real, at_once, own_transfers
 
 _TOTAL_STEP = 16  # steps between powers of two, in which totals are rounded up
 
@@ -82,7 +82,7 @@ class EdgeList(KeptSearch):
             held = int(self.offsets[-1])
             return np.asarray(self.receivers)[:held], np.asarray(self.senders)[:held]
 
-    def edges(self, positions: Array, box: Box | None = None, *, queries: Array | None = None) -> Edges:
+    def edges(self, positions: Points, box: Box | None = None, *, queries: Points | None = None) -> Edges:
         """Return the edges with their geometry at these positions.
 
         `jax.ops.segment_sum(messages, edges.receivers, m, indices_are_sorted=True)` sums messages for the receivers; `messages` of
@@ -121,7 +121,7 @@ class EdgeList(KeptSearch):
             ends = by_sender, by_receiver, self.offsets[-1]
             return edges_of(ends, self.status, self._images_made(), *where, cutoff, kind, self.closed, self.half)
 
-    def to_jraph(self, positions: Array, box: Box | None = None) -> Graph:
+    def to_jraph(self, positions: Points, box: Box | None = None) -> Graph:
         """Return the edges as a graph of jraph, as `NeighborList.to_jraph` does; jraph need not be installed.
 
         Raises:
@@ -147,7 +147,7 @@ class EdgeList(KeptSearch):
     def _room_for(self, needed: int) -> int:
         return round_total(needed)
 
-    def _count_room(self, inputs: Inputs, options: Options, slack: float) -> int:
+    def _count_room(self, inputs: Inputs, options: Options, slack: Real) -> int:
         return count_total(inputs, options, slack)
 
     def _find(self, inputs: Inputs, room: int) -> dict[str, Any]:
@@ -177,7 +177,7 @@ def round_total(pairs: int) -> int:
     return min(-(-max(pairs, 1) // step) * step, MOST_PAIRS)
 
 
-def count_total(inputs: Inputs, options: Options, slack: float) -> int:
+def count_total(inputs: Inputs, options: Options, slack: Real) -> int:
     """Count the pairs at concrete positions; return a total of `slack` times as many.
 
     Raises:

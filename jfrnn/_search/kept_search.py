@@ -45,7 +45,7 @@ from jfrnn._search.kept_options import KeptOptions
 from jfrnn._search.problem import Problem
 from jfrnn._search.reverse import Reverse
 from jfrnn._search.verlet import Verlet, has_moved_too_far
-from jfrnn._tracing import Given, call_apart, compile_program, own_transfers
+from jfrnn._tracing import Flags, Given, Numbers, Points, Real, call_apart, compile_program, own_transfers
 
 Kept = TypeVar("Kept", bound="KeptSearch")
 
@@ -95,7 +95,7 @@ class KeptSearch(KeptOptions):
         """Round the room that is needed up, so that similar scenes share a program."""
         raise NotImplementedError
 
-    def _count_room(self, inputs: Inputs, options: Options, slack: float) -> int:
+    def _count_room(self, inputs: Inputs, options: Options, slack: Real) -> int:
         """Return the room that a search at concrete positions takes, `slack` times."""
         raise NotImplementedError
 
@@ -157,12 +157,12 @@ class KeptSearch(KeptOptions):
 
     def update(
         self,
-        positions: Array,
+        positions: Points,
         box: Box | None = None,
         *,
-        cutoff: Array | tuple[Array, Array] | None = None,
-        queries: Array | None = None,
-        active: Array | None = None,
+        cutoff: Numbers | Points | tuple[Numbers, Numbers] | None = None,
+        queries: Points | None = None,
+        active: Flags | None = None,
     ) -> Self:
         """Rebuild the list if anything has moved skin/2 since the last time, or may have by rounding; without a skin, always.
 
@@ -198,13 +198,13 @@ class KeptSearch(KeptOptions):
 
     def grow(
         self,
-        positions: Array,
+        positions: Points,
         box: Box | None = None,
         *,
-        cutoff: Array | tuple[Array, Array] | None = None,
-        queries: Array | None = None,
-        active: Array | None = None,
-        slack: float = 1.25,
+        cutoff: Numbers | Points | tuple[Numbers, Numbers] | None = None,
+        queries: Points | None = None,
+        active: Flags | None = None,
+        slack: Real = 1.25,
     ) -> Self:
         """Make a list with more room at these positions, where it overflowed. Not inside jit: the room is a shape.
 
@@ -228,22 +228,23 @@ class KeptSearch(KeptOptions):
                 room can fix: non-finite positions, or a degenerate box.
         """
         sources, rows, box = self._geometry_inputs(positions, queries, box)
-        queries, active, slack = rows if self.own_queries else None, self._check_active(active, sources), check_slack(slack)
-        radii = self._radii_now(cutoff, sources, queries)
-        if any(isinstance(x, Tracer) for x in jax.tree.leaves((sources, queries, active, box, radii, self.required))):
+        rows = rows if self.own_queries else None
+        radii, slack = self._radii_now(cutoff, sources, rows), check_slack(slack)
+        active = self._check_active(active, sources)
+        if any(isinstance(x, Tracer) for x in jax.tree.leaves((sources, rows, active, box, radii, self.required))):
             raise TypeError("grow() changes the shape of the list and cannot run inside jax.jit: call it on what jit returns.")
         images = self._grow_images(box, radii)
         wider = _replace(self, problem=self.problem.with_images(images))
         if box is not None and images is not None:
             box = box_of_list(box, images, self.problem.reach(radii))
-        inputs, options = self.problem.inputs(sources, queries, active, box, radii, self.batch, self.exclude), wider.problem.options
+        inputs, options = self.problem.inputs(sources, rows, active, box, radii, self.batch, self.exclude), wider.problem.options
         with own_transfers():
             met = self._room_for(math.ceil(slack * int(np.max(np.asarray(self.required)))))
             made = _remake(wider, inputs, max(self._room, met, self._count_room(inputs, options, slack)))
         made.check()
         return made
 
-    def _check_active(self, active: Array | None, sources: Array) -> Array | None:
+    def _check_active(self, active: Flags | None, sources: Array) -> Array | None:
         if self.masked != (active is not None):
             state = "with active: pass active=" if self.masked else "without active: leave active out"
             raise ValueError(f"this list was made {state}.")
@@ -285,7 +286,7 @@ class KeptSearch(KeptOptions):
         made = None if self.images is None or self.verlet is None else (self.verlet.positions, self.verlet.queries)
         return self.images, made
 
-    def _geometry_inputs(self, positions: Array, queries: Array | None, box: Box | None) -> tuple[Array, Array, Box | None]:
+    def _geometry_inputs(self, positions: Points, queries: Points | None, box: Box | None) -> tuple[Array, Array, Box | None]:
         """Return the present positions of sources and rows, as lengths, and the present box, after checking that they fit."""
         sources, rows = self._check_points(positions, queries)
         box = self._box_now(box, sources)
@@ -293,7 +294,7 @@ class KeptSearch(KeptOptions):
         real, asking = real_points(sources, asking, box, self.batch, self.problem.options.engine.translates)
         return real, real if asking is None else asking, box
 
-    def _check_points(self, positions: Array, queries: Array | None) -> tuple[Array, Array]:
+    def _check_points(self, positions: Points, queries: Points | None) -> tuple[Array, Array]:
         sources = check_again("positions", positions, self.dtype, self.dim, self.source_count)
         check_devices("positions", sources, self.status)
         if self.own_queries != (queries is not None):

@@ -24,7 +24,7 @@ from jfrnn._search.list_exports import ListExports
 from jfrnn._search.making import count_capacity, find_fields, round_capacity
 from jfrnn._search.reverse import MOST_SLOTS
 from jfrnn._search.topology import Topology, make_topology
-from jfrnn._tracing import own_transfers
+from jfrnn._tracing import Points, Real, Size, own_transfers
 
 _FEW_SLOTS = 1 << 18  # up to which a program takes longer to compile than its displacements to compute
 
@@ -85,7 +85,7 @@ class NeighborList(ListExports):
             status = self.status | jnp.where(missing, jnp.int32(Status.TOTAL_OVERFLOW.value), 0)
         return dataclasses.replace(self, status=status)
 
-    def vectors(self, positions: Array, box: Box | None = None, *, queries: Array | None = None) -> tuple[Array, Array]:
+    def vectors(self, positions: Points, box: Box | None = None, *, queries: Points | None = None) -> tuple[Array, Array]:
         """Compute the displacements x_j - x_i to all neighbors, in a periodic box plus the lattice translation of the image.
 
         Args:
@@ -109,7 +109,7 @@ class NeighborList(ListExports):
         with own_transfers():
             return self._mark(vectors), mask
 
-    def shifts(self, positions: Array, box: Box | None = None, *, queries: Array | None = None) -> Array:
+    def shifts(self, positions: Points, box: Box | None = None, *, queries: Points | None = None) -> Array:
         """Compute the lattice shift S of every neighbor: its displacement is x_j - x_i + S·(lattice vectors).
 
         Every used slot has a shift, even if its pair lies in the skin, beyond the cutoff: `nbrs.shifts(x)[nbrs.idx <
@@ -141,7 +141,7 @@ class NeighborList(ListExports):
                 return self._mark(periodic_vectors(*given, self._cutoff_of_pairs(), self.closed, self.half, True)[2])
             return self._mark(lattice_shifts(*given, self.half))
 
-    def distances(self, positions: Array, box: Box | None = None, *, queries: Array | None = None) -> tuple[Array, Array]:
+    def distances(self, positions: Points, box: Box | None = None, *, queries: Points | None = None) -> tuple[Array, Array]:
         """Compute the distance to every neighbor.
 
         Args:
@@ -171,7 +171,9 @@ class NeighborList(ListExports):
             made, mask = lengths(topology, self.count, self._images_made(), sources, box, self.box_kind, cutoff, self.closed)
             return self._mark(made), mask
 
-    def edges(self, positions: Array, total: int | None = None, box: Box | None = None, *, queries: Array | None = None) -> Edges:
+    def edges(
+        self, positions: Points, total: Size | None = None, box: Box | None = None, *, queries: Points | None = None
+    ) -> Edges:
         """Return the pairs as edges of a graph, with their geometry, for graph networks inside jit.
 
         Edges lead from neighbors j to particles i and are sorted by i, so `jax.ops.segment_sum(messages, edges.receivers, m,
@@ -214,7 +216,7 @@ class NeighborList(ListExports):
         check_held(made.pair_count, total)
         return made
 
-    def to_jraph(self, positions: Array, total: int | None = None, box: Box | None = None) -> Graph:
+    def to_jraph(self, positions: Points, total: Size | None = None, box: Box | None = None) -> Graph:
         """Return the edges as a graph of jraph, with displacements, distances and lattice shifts; jraph need not be installed.
 
         Args:
@@ -237,7 +239,7 @@ class NeighborList(ListExports):
             raise ValueError("to_jraph() makes particles the nodes of a graph, and this list has queries: take `edges`.")
         return make_graph(self.edges(positions, total, box=box), self._geometry_inputs(positions, None, box)[0])
 
-    def _near(self, positions: Array, queries: Array | None, box: Box | None) -> Array:
+    def _near(self, positions: Points, queries: Points | None, box: Box | None) -> Array:
         return self._geometry(positions, queries, box)[1]
 
     @property
@@ -251,13 +253,13 @@ class NeighborList(ListExports):
     def _room_for(self, needed: int) -> int:
         return round_capacity(needed)
 
-    def _count_room(self, inputs: Inputs, options: Options, slack: float) -> int:
-        return count_capacity(inputs, options, slack)
+    def _count_room(self, inputs: Inputs, options: Options, slack: Real) -> int:
+        return count_capacity(inputs, options, float(slack))
 
     def _find(self, inputs: Inputs, room: int) -> dict[str, Any]:
         return find_fields(inputs, self.problem.options, room, self.skin > 0, self.reverse is not None)
 
-    def _geometry(self, positions: Array, queries: Array | None, box: Box | None) -> tuple[Array, Array, Array | None]:
+    def _geometry(self, positions: Points, queries: Points | None, box: Box | None) -> tuple[Array, Array, Array | None]:
         return self._geometry_of(*self._geometry_inputs(positions, queries, box), as_given=True)
 
     def _geometry_of(

@@ -14,28 +14,41 @@ from jfrnn._search.making import count_capacity, find_fields, find_flat_fields
 from jfrnn._search.neighbor_list import NeighborList
 from jfrnn._search.problem import check_problem
 from jfrnn._search.reverse import MOST_SLOTS
-from jfrnn._tracing import call_apart, own_transfers
+from jfrnn._tracing import (
+    AnyCutoff,
+    Backend,
+    Flag,
+    Flags,
+    IndexRows,
+    Indices,
+    Points,
+    RadiusRule,
+    Real,
+    Size,
+    call_apart,
+    own_transfers,
+)
 
 
 def search(
-    positions: Array,
-    cutoff: float | Array | tuple[Array, Array],
+    positions: Points,
+    cutoff: AnyCutoff,
     *,
-    queries: Array | None = None,
+    queries: Points | None = None,
     box: Box | None = None,
-    batch: Array | tuple[Array, Array] | None = None,
-    radius_rule: str = "gather",
-    species: Array | tuple[Array, Array] | None = None,
-    exclude: Array | None = None,
-    half: bool = False,
-    include_self: bool = False,
-    closed: bool = False,
-    skin: float = 0.0,
-    active: Array | None = None,
-    capacity: int | None = None,
-    slack: float = 1.0,
-    reverse: bool = False,
-    backend: str = "auto",
+    batch: Indices | tuple[Indices, Indices] | None = None,
+    radius_rule: RadiusRule = "gather",
+    species: Indices | tuple[Indices, Indices] | None = None,
+    exclude: IndexRows | None = None,
+    half: Flag = False,
+    include_self: Flag = False,
+    closed: Flag = False,
+    skin: Real = 0.0,
+    active: Flags | None = None,
+    capacity: Size | None = None,
+    slack: Real = 1.0,
+    reverse: Flag = False,
+    backend: Backend = "auto",
 ) -> NeighborList:
     """Find every pair of particles closer than a cutoff, exactly.
 
@@ -153,24 +166,24 @@ def search(
 
 
 def search_edges(
-    positions: Array,
-    cutoff: float | Array | tuple[Array, Array],
+    positions: Points,
+    cutoff: AnyCutoff,
     *,
-    total: int | None = None,
-    queries: Array | None = None,
+    total: Size | None = None,
+    queries: Points | None = None,
     box: Box | None = None,
-    batch: Array | tuple[Array, Array] | None = None,
-    radius_rule: str = "gather",
-    species: Array | tuple[Array, Array] | None = None,
-    exclude: Array | None = None,
-    half: bool = False,
-    include_self: bool = False,
-    closed: bool = False,
-    skin: float = 0.0,
-    active: Array | None = None,
-    slack: float = 1.0,
-    reverse: bool = False,
-    backend: str = "auto",
+    batch: Indices | tuple[Indices, Indices] | None = None,
+    radius_rule: RadiusRule = "gather",
+    species: Indices | tuple[Indices, Indices] | None = None,
+    exclude: IndexRows | None = None,
+    half: Flag = False,
+    include_self: Flag = False,
+    closed: Flag = False,
+    skin: Real = 0.0,
+    active: Flags | None = None,
+    slack: Real = 1.0,
+    reverse: Flag = False,
+    backend: Backend = "auto",
 ) -> EdgeList:
     """Find every pair of particles closer than a cutoff, as edges one after another, sorted by receiver.
 
@@ -232,20 +245,20 @@ def search_edges(
 
 
 def count(
-    positions: Array,
-    cutoff: float | Array | tuple[Array, Array],
+    positions: Points,
+    cutoff: AnyCutoff,
     *,
-    queries: Array | None = None,
+    queries: Points | None = None,
     box: Box | None = None,
-    batch: Array | tuple[Array, Array] | None = None,
-    radius_rule: str = "gather",
-    species: Array | tuple[Array, Array] | None = None,
-    exclude: Array | None = None,
-    half: bool = False,
-    include_self: bool = False,
-    closed: bool = False,
-    active: Array | None = None,
-    backend: str = "auto",
+    batch: Indices | tuple[Indices, Indices] | None = None,
+    radius_rule: RadiusRule = "gather",
+    species: Indices | tuple[Indices, Indices] | None = None,
+    exclude: IndexRows | None = None,
+    half: Flag = False,
+    include_self: Flag = False,
+    closed: Flag = False,
+    active: Flags | None = None,
+    backend: Backend = "auto",
 ) -> Array:
     """Count the neighbors that `search` would list, without listing them. All arguments are those of `search`.
 

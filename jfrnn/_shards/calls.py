@@ -29,7 +29,7 @@ class Asked(NamedTuple):
     skin: float
     include_self: bool
     closed: bool
-    backend: str
+    backend: Given
 
 
 def check_asked(particles: object, cutoff: Given, skin: object, include_self: object, closed: object, backend: Given) -> Asked:

@@ -15,22 +15,22 @@ from jfrnn._geometry import Box, check_box, check_cutoff, check_positions, check
 from jfrnn._search import list_radius
 from jfrnn._shards.migrate import migrate
 from jfrnn._shards.particles import Particles, Sizes, no_requirements, place_rows, replicate, resize, room
-from jfrnn._tracing import Given, Tree
+from jfrnn._tracing import Given, Number, Points, Real, Tree, as_array, default_float
 
 _MOST = 2**31 - 1
 _SMALL = 1024  # particles per message for which the first guess leaves room: a wrong guess costs a compilation
 
 
 def scatter(
-    positions: np.ndarray | Array,
-    cutoff: float,
+    positions: Points,
+    cutoff: Number,
     values: Tree = None,
     *,
     mesh: Mesh,
-    skin: float = 0.0,
+    skin: Real = 0.0,
     box: Box | None = None,
     along: Sequence[int] | None = None,
-    slack: float = 1.25,
+    slack: Real = 1.25,
 ) -> Particles:
     """Distribute particles evenly over a mesh of devices, each device getting a region of space.
 
@@ -55,6 +55,7 @@ def scatter(
     """
     if any(isinstance(x, Tracer) for x in jax.tree.leaves((positions, values, box))):
         raise TypeError("scatter() chooses shapes from data and cannot run inside jax.jit: call it before, on arrays.")
+    positions = as_array("positions", positions, default_float())
     check_positions("positions", positions[:0] if hasattr(positions, "shape") and np.ndim(positions) else positions)
     x = np.asarray(positions)
     if len(x) > _MOST:
@@ -122,6 +123,7 @@ def fetch(array: Array) -> np.ndarray:
 
 def _check_value(path: KeyPath, leaf: Given, total: int) -> np.ndarray:
     name = f"values{jax.tree_util.keystr(path)}"
+    leaf = as_array(name, leaf)
     if not hasattr(leaf, "shape") or not hasattr(leaf, "dtype"):
         raise TypeError(f"{name} must be an array with a row per particle, got {type(leaf).__name__}.")
     if tuple(leaf.shape[:1]) != (total,):

@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -27,19 +27,19 @@ from jfrnn._shards.halo import Halo, exchange, halo_in_shard
 from jfrnn._shards.particles import Particles, of_shards
 from jfrnn._shards.sharded_list import Neighbors, list_on_shards
 from jfrnn._sums import pair_sum as pair_sum_on_one
-from jfrnn._tracing import Tree
+from jfrnn._tracing import Flag, Number, Real, Size, Tree
 
 
 def search(
     particles: Particles,
-    cutoff: float,
+    cutoff: Number,
     *,
-    skin: float = 0.0,
-    include_self: bool = False,
-    closed: bool = False,
-    capacity: int | None = None,
-    slack: float = 1.0,
-    backend: str = "auto",
+    skin: Real = 0.0,
+    include_self: Flag = False,
+    closed: Flag = False,
+    capacity: Size | None = None,
+    slack: Real = 1.0,
+    backend: Literal["auto", "warp", "jax", "brute"] = "auto",
 ) -> Neighbors:
     """Find every pair of particles closer than a cutoff, on any devices: exactly the pairs of `jfrnn.search` on one device.
 
@@ -74,11 +74,11 @@ def search(
 
 def count(
     particles: Particles,
-    cutoff: float,
+    cutoff: Number,
     *,
-    include_self: bool = False,
-    closed: bool = False,
-    backend: str = "auto",
+    include_self: Flag = False,
+    closed: Flag = False,
+    backend: Literal["auto", "warp", "jax", "brute"] = "auto",
     halo: Halo | None = None,
 ) -> Array:
     """Count the neighbors that `search` would list.
@@ -108,14 +108,14 @@ def count(
 def pair_sum(
     fn: Callable[[Array, Any, Any], Any],
     particles: Particles,
-    cutoff: float | None,
+    cutoff: Number | None,
     values: Tree = None,
     *,
-    reduce: str = "sum",
-    include_self: bool = False,
-    closed: bool = False,
-    compensated: bool = False,
-    backend: str = "auto",
+    reduce: Literal["sum", "max", "min"] = "sum",
+    include_self: Flag = False,
+    closed: Flag = False,
+    compensated: Flag = False,
+    backend: Literal["auto", "warp", "jax", "brute"] = "auto",
     neighbors: Neighbors | None = None,
     halo: Halo | None = None,
 ) -> Tree:

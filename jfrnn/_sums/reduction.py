@@ -38,7 +38,7 @@ from jfrnn._sums.pair_function import call_with_pair
 from jfrnn._sums.relations import Kept, Listed, Relation, Searched
 from jfrnn._sums.summation import bind_sum
 from jfrnn._sums.terms import OF_QUERIES, OF_SOURCES, Groups, Labels, Summand, Term, choose, fresh_labels, trace
-from jfrnn._tracing import Given, Tree, call_apart, compile_program, on_device
+from jfrnn._tracing import Given, Points, Tree, call_apart, compile_program, on_device
 
 
 class Pairs(NamedTuple):
@@ -84,7 +84,13 @@ def pairs_of_search(problem: Problem, inputs: Inputs, summed: bool) -> Pairs:
 
 
 def pairs_of_list(
-    nbrs: NeighborList, positions: Array, cutoff: Given, queries: Array | None, box: Box | None, given: dict[str, bool], full: bool
+    nbrs: NeighborList,
+    positions: Points,
+    cutoff: Given,
+    queries: Points | None,
+    box: Box | None,
+    given: dict[str, bool],
+    full: bool,
 ) -> Pairs:
     """Return the pairs of a list, after checking that no argument in `given` contradicts it; `full` refuses half lists."""
     if not isinstance(nbrs, NeighborList):

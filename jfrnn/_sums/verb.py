@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Literal, TypeVar
 
 import jax
 from jax import Array
@@ -11,34 +11,49 @@ from jax.tree_util import KeyPath
 from jfrnn._engine import ARRAYS, ENGINES, Inputs, Kind, Options, parse_backend, platform_of
 from jfrnn._geometry import Box, check_flag
 from jfrnn._search import NeighborList, check_problem
-from jfrnn._tracing import Given, Tree, on_device, own_transfers
+from jfrnn._tracing import (
+    AnyCutoff,
+    Backend,
+    Flag,
+    Flags,
+    Given,
+    IndexRows,
+    Indices,
+    Points,
+    RadiusRule,
+    Tree,
+    as_array,
+    on_device,
+    own_transfers,
+)
 
+Sums = TypeVar("Sums")  # what the function of a pair returns, and with one more axis the sum
 REDUCTIONS = ("sum", "max", "min")
 SYMMETRIES = (None, "symmetric", "antisymmetric")
 
 
 def pair_sum(
-    fn: Callable[[Array, Any, Any], Any],
-    positions: Array,
-    cutoff: float | Array | tuple[Array, Array] | None,
+    fn: Callable[[Array, Any, Any], Sums],
+    positions: Points,
+    cutoff: AnyCutoff | None,
     values: Tree = None,
     *,
     query_values: Tree = None,
-    reduce: str = "sum",
-    symmetry: str | None = None,
-    queries: Array | None = None,
+    reduce: Literal["sum", "max", "min"] = "sum",
+    symmetry: Literal["symmetric", "antisymmetric"] | None = None,
+    queries: Points | None = None,
     box: Box | None = None,
-    batch: Array | tuple[Array, Array] | None = None,
-    radius_rule: str = "gather",
-    species: Array | tuple[Array, Array] | None = None,
-    exclude: Array | None = None,
-    include_self: bool = False,
-    closed: bool = False,
-    active: Array | None = None,
-    compensated: bool = False,
-    backend: str = "auto",
+    batch: Indices | tuple[Indices, Indices] | None = None,
+    radius_rule: RadiusRule = "gather",
+    species: Indices | tuple[Indices, Indices] | None = None,
+    exclude: IndexRows | None = None,
+    include_self: Flag = False,
+    closed: Flag = False,
+    active: Flags | None = None,
+    compensated: Flag = False,
+    backend: Backend = "auto",
     neighbors: NeighborList | None = None,
-) -> Tree:
+) -> Sums:
     """Sum a function of pairs over the neighbors of each particle, without a neighbor list; differentiable to every order.
 
     result[i] = sum over the neighbors j of i of fn(r_ij, i, j), with the displacement r_ij = x_j - x_i (in a periodic box +
@@ -175,6 +190,7 @@ def _with_engine(options: Options, inputs: Inputs, may_change: bool) -> Options:
 
 def _check_values(name: str, values: Tree, size: int, what: str) -> Tree:
     def check_leaf(path: KeyPath, leaf: Given) -> Array:
+        leaf = as_array(f"{name}{jax.tree_util.keystr(path)}", leaf)
         if not hasattr(leaf, "shape") or not hasattr(leaf, "dtype"):
             raise TypeError(
                 f"{name}{jax.tree_util.keystr(path)} must be an array with a row per {what}, got {type(leaf).__name__}."

@@ -26,7 +26,7 @@ from jfrnn._geometry import (
     shape_of,
 )
 from jfrnn._search import norms, round_capacity
-from jfrnn._tracing import call_apart, compile_program, own_transfers
+from jfrnn._tracing import Points, Real, call_apart, compile_program, own_transfers
 from jfrnn._triangles.cells import TriangleCells, gather_corners
 from jfrnn._triangles.closest import Rows, nearest_of, pseudonormals
 from jfrnn._triangles.contacts import are_contacts
@@ -108,7 +108,7 @@ class TriangleList:
         with own_transfers():
             return (self.status & Status.ROW_OVERFLOW.value) != 0
 
-    def update(self, positions: Array, vertices: Array | None = None) -> "TriangleList":
+    def update(self, positions: Points, vertices: Points | None = None) -> "TriangleList":
         """Rebuild the list at these positions, in the same shapes: a simulation step inside `jax.jit` or `lax.scan`.
 
         Status bits and `required` are kept over all updates; read `overflow` after a chunk of steps, `grow` and run it again.
@@ -132,7 +132,7 @@ class TriangleList:
         found |= {"status": found["status"] | self.status, "required": jnp.maximum(found["required"], self.required)}
         return dataclasses.replace(self, **found, closed=self._copy_closed())
 
-    def grow(self, positions: Array, vertices: Array | None = None, *, slack: float = 1.25) -> "TriangleList":
+    def grow(self, positions: Points, vertices: Points | None = None, *, slack: Real = 1.25) -> "TriangleList":
         """Make a list with a capacity that suffices at these positions. Not inside jit: the capacity is a shape.
 
         Args:
@@ -151,7 +151,8 @@ class TriangleList:
         if any(isinstance(x, Tracer) for x in jax.tree.leaves((points, corners, self.required))):
             raise TypeError("grow() changes the shape of the list and cannot run inside jax.jit: call it on what jit returns.")
         with own_transfers():
-            met = round_capacity(math.ceil(check_slack(slack) * int(np.max(np.asarray(self.required)))))
+            slack = check_slack(slack)
+            met = round_capacity(math.ceil(slack * int(np.max(np.asarray(self.required)))))
         counted = count_slots(points, corners, self.faces, self.cutoff, self._engine, slack)
         capacity, cells = max(self.capacity, met, counted), self.cells if vertices is None else None
         found = find_fields(points, corners, self.faces, cells, self.cutoff, self._engine, capacity)
@@ -187,7 +188,7 @@ class TriangleList:
             return x  # `_check_rows` has raised
         return mark_rows(x, are_whole(self.status, ~Status.ROW_OVERFLOW))
 
-    def closest(self, positions: Array, vertices: Array | None = None) -> tuple[Array, Array, Array]:
+    def closest(self, positions: Points, vertices: Points | None = None) -> tuple[Array, Array, Array]:
         """Compute the nearest point of every triangle in a row.
 
         Distances, also to slivers, are accurate to 4 eps of the dtype times the largest coordinate of a corner relative to the
@@ -218,7 +219,7 @@ class TriangleList:
         vectors = self._mark(vectors)
         return points[:, None] + vectors, norms(vectors), mask
 
-    def contacts(self, positions: Array, vertices: Array | None = None) -> tuple[Array, Array, Array]:
+    def contacts(self, positions: Points, vertices: Points | None = None) -> tuple[Array, Array, Array]:
         """Compute the contacts of spheres with walls: the nearest points of `closest`, one per wall instead of one per triangle.
 
         A triangle yields to another one of its row that has the corner or side on which its nearest point lies and that is nearer,
@@ -262,7 +263,7 @@ class TriangleList:
         vectors = self._mark(vectors)
         return points[:, None] + vectors, norms(vectors), mask
 
-    def signed_distance(self, positions: Array, vertices: Array | None = None) -> SignedDistance:
+    def signed_distance(self, positions: Points, vertices: Points | None = None) -> SignedDistance:
         """Compute the distance to the nearest triangle of each row, negative inside the solid that the triangles enclose.
 
         A point is inside if the winding number of the triangles is 1 or more, so closed parts that overlap, touch, nest or are
@@ -298,7 +299,7 @@ class TriangleList:
         found = _signed_distance(tri, points, corners)
         return found._replace(distance=self._mark(found.distance), normal=self._mark(found.normal))
 
-    def _check_points(self, positions: Array, vertices: Array | None) -> tuple[Array, Array]:
+    def _check_points(self, positions: Points, vertices: Points | None) -> tuple[Array, Array]:
         dtype, (count, dim) = np.dtype(self.vertices.dtype), self.vertices.shape
         points = check_again("positions", positions, dtype, dim, self.idx.shape[0])
         check_devices("positions", points, self.idx)

@@ -1,12 +1,14 @@
 """The public function `search_triangles`: find the triangles of a wall that are closer to particles than a cutoff."""
 
+from typing import Literal
+
 import numpy as np
 from jax import Array
 from jax.core import Tracer
 
 from jfrnn._engine import ARRAYS, PLATFORMS, WARP, choose_engine, parse_backend, platform_of
 from jfrnn._geometry import check_capacity, check_cutoff, check_is_known, check_positions, check_slack
-from jfrnn._tracing import Given, gather, make_on_host
+from jfrnn._tracing import Given, IndexRows, Number, Points, Real, Size, as_array, gather, make_on_host
 from jfrnn._triangles.engines import TRIANGLE_ENGINES, TriangleEngine, fastest_of
 from jfrnn._triangles.programs import count_slots, find_fields
 from jfrnn._triangles.triangle_list import TriangleList
@@ -14,14 +16,14 @@ from jfrnn._triangles.winding import is_closed
 
 
 def search_triangles(
-    positions: Array,
-    vertices: Array,
-    faces: Array,
-    cutoff: float,
+    positions: Points,
+    vertices: Points,
+    faces: IndexRows,
+    cutoff: Number,
     *,
-    capacity: int | None = None,
-    slack: float = 1.0,
-    backend: str = "auto",
+    capacity: Size | None = None,
+    slack: Real = 1.0,
+    backend: Literal["auto", "warp", "bvh", "jax"] = "auto",
 ) -> TriangleList:
     """Find all triangles of a wall that are closer to a particle than a cutoff, exactly, each once; in 2D all segments.
 
@@ -90,6 +92,7 @@ def search_triangles(
 def _check_faces(faces: Given, dim: int, vertices: int) -> Array:
     """Return faces as int32 [f, dim]; invalid indices stay out of range."""
     kind = "triangles" if dim == 3 else "segments"
+    faces = as_array("faces", faces)
     if not hasattr(faces, "dtype") or not np.issubdtype(faces.dtype, np.integer):
         given = f"{np.dtype(faces.dtype)}" if hasattr(faces, "dtype") else type(faces).__name__
         raise TypeError(f"faces must be an array of integers of shape [f, {dim}], the vertices of {kind}, got {given}.")

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from functools import cached_property
-from typing import Any, Protocol, TypeVar
+from typing import Any, Literal, Protocol, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -124,8 +124,8 @@ def total_of_own(
     values: Values,
     kernel: Kernel,
     h: Array,
-    rule: str,
-    backend: str = "auto",
+    rule: Literal["gather", "either"],
+    backend: Any = "auto",  # noqa: ANN401
 ) -> Any:  # noqa: ANN401
     """Sum a term over the neighbors of each particle, where each particle has its own smoothing length.
 

@@ -41,7 +41,7 @@ class Spread:
     particles: Particles
     halo: Halo | None
     active: Array | None
-    backend: str = field(metadata={"static": True})
+    backend: Any = field(metadata={"static": True})
 
     @property
     def overflow(self) -> Array:

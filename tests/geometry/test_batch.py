@@ -151,7 +151,7 @@ PAIR = {"queries": X[:2]}
     ("error", "match", "options"),
     [
         (TypeError, "batch must be an array of integers, the system of each particle, got float32", {"batch": X[:, 0]}),
-        (TypeError, "batch must be an array of integers.*got list", {"batch": [0, 0, 1, 1]}),
+        (TypeError, "batch must be an array of integers.*got set", {"batch": {0, 1}}),
         (ValueError, r"batch must have shape \[4\], the system of each particle, got shape \[3\]", {"batch": SYSTEMS[:3]}),
         (ValueError, r"batch holds numbers from 0 to 4294967296", {"batch": np.array([0, 1, 2, 2**32])}),
         (

@@ -309,7 +309,7 @@ X = np.zeros((4, 3), np.float32)
 @pytest.mark.parametrize(
     ("error", "match", "arguments"),
     [
-        (TypeError, r"positions must be a JAX or NumPy array.*got list", {"positions": [[0.0, 0.0]]}),
+        (TypeError, r"positions must be a JAX or NumPy array.*got set", {"positions": {0.0}}),
         (TypeError, r"positions must be float32 or float64, got int64", {"positions": np.zeros((4, 3), np.int64)}),
         (TypeError, r"positions must be float32 or float64, got float16", {"positions": np.zeros((4, 3), np.float16)}),
         (ValueError, r"positions must have shape \[n, 2\] or \[n, 3\].*got shape \[3\]", {"positions": X[0]}),

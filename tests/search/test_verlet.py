@@ -305,8 +305,6 @@ def test_refusals(dim):
         jax.jit(lambda s: jfrnn.search(x, CUTOFF, skin=s, capacity=4))(0.1)
     with pytest.raises(TypeError, match=r"active must be an array of bool, one per particle, got int64 of shape \[10\]"):
         jfrnn.search(x, CUTOFF, active=np.ones(10, np.int64))
-    with pytest.raises(TypeError, match="active must be an array of bool, one per particle, got list"):
-        jfrnn.search(x, CUTOFF, active=[True] * 10)
     with pytest.raises(ValueError, match=r"active must have shape \[10\], one bool per particle, got shape \[9\]"):
         jfrnn.search(x, CUTOFF, active=np.ones(9, bool))
     nbrs = jfrnn.search(x, CUTOFF, skin=SKIN)

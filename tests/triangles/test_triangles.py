@@ -149,7 +149,7 @@ def test_nothing_is_near_nothing(dtype, dim):
         ({"vertices": np.zeros((4, 2), np.float32)}, ValueError, r"vertices must match positions \(float32, 3 columns\)"),
         ({"vertices": np.zeros((4, 3))}, ValueError, r"vertices must match positions"),
         ({"faces": np.zeros((2, 3))}, TypeError, r"faces must be an array of integers of shape \[f, 3\], .* got float64"),
-        ({"faces": [[0, 1, 2]]}, TypeError, r"faces must be an array of integers .* got list"),
+        ({"faces": {0, 1, 2}}, TypeError, r"faces must be an array of integers .* got set"),
         ({"faces": np.zeros((2, 4), int)}, ValueError, r"faces must have shape \[f, 3\], the vertices of triangles in 3D"),
         ({"cutoff": 0.0}, ValueError, r"cutoff must be positive and finite"),
         ({"cutoff": 1e-40}, ValueError, r"cutoff=.* is outside"),

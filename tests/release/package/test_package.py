@@ -16,6 +16,7 @@ import pytest
 from places import ROOT
 
 import jfrnn
+from jfrnn import __main__
 
 SEARCH = """
 import doctest, jfrnn, numpy as np
@@ -72,17 +73,19 @@ def test_wheel_holds_the_library_alone(wheel):
 
 
 def test_a_wheel_made_from_the_sdist_holds_the_same(wheel, tmp_path):
-    """The source distribution is whole: nothing of the checkout is needed beside it."""
+    """The source distribution is whole: it holds every file of the repository, and nothing of the checkout is needed beside it."""
     build = f"from setuptools import build_meta; print(build_meta.build_sdist({str(tmp_path)!r}))"
     tree = tmp_path / "tree"
     command = ["git", "ls-files", "--cached", "--others", "--exclude-standard"]
-    for name in subprocess.run(command, cwd=ROOT, check=True, capture_output=True, text=True).stdout.splitlines():
-        if name.split("/")[0] not in ("docs", "notebooks", "experiments", "tests") and (ROOT / name).exists():
-            (tree / name).parent.mkdir(parents=True, exist_ok=True)
-            shutil.copy2(ROOT / name, tree / name, follow_symlinks=False)
+    listed = subprocess.run(command, cwd=ROOT, check=True, capture_output=True, text=True).stdout.splitlines()
+    names = {name for name in listed if (ROOT / name).exists()}
+    for name in names:
+        (tree / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy2(ROOT / name, tree / name, follow_symlinks=False)
     made = tmp_path / run("-c", build, cwd=tree).split()[-1]
     assert made.name == f"jfrnn-{jfrnn.__version__}.tar.gz"
     with tarfile.open(made) as held:
+        assert names - {name.partition("/")[2] for name in held.getnames()} == {"jfrnn/cases", "jfrnn/kernels"}  # links to packages
         held.extractall(tmp_path / "from", filter="data")
     (source,) = (tmp_path / "from").iterdir()
     run(
@@ -123,9 +126,8 @@ def test_extras_are_there_for_a_resolver(wheel, tmp_path):
 @pytest.mark.parametrize(
     ("extras", "engine"), [("", "jax"), ("[warp]", "warp"), ("[sph]", "jax"), ("[cuda13]", "jax"), ("[warp,cuda13]", "warp")]
 )
-def test_wheel_works_in_a_fresh_environment_with_each_extra(wheel, tmp_path, extras):
+def test_wheel_works_in_a_fresh_environment_with_each_extra(wheel, tmp_path, extras, engine):
     """Everything is fetched: those of CUDA take gigabytes."""
-    engine = "warp" if "warp" in extras else "jax"
     run("-m", "venv", str(tmp_path / "venv"), cwd=tmp_path)
     python = str(tmp_path / "venv" / "bin" / "python")
     run("-m", "pip", "install", "--quiet", "--no-compile", "--no-cache-dir", f"{wheel}{extras}", cwd=tmp_path, python=python)
@@ -180,4 +182,29 @@ def test_links_and_pictures_of_a_package_page_lead_somewhere(wheel, tmp_path, re
 def test_command_says_which_engines_run():
     said = run("-m", "jfrnn", cwd=ROOT)
     assert f"jfrnn {jfrnn.__version__}: Python" in said
-    assert [f"  {name:9} right" for name in ("jax", "warp", "hashgrid", "brute") if f"  {name:9} right" not in said] == []
+    wanted = {
+        "jax": "pairs, sum and gradient,",
+        "warp": "pairs, sum and gradient,",
+        "hashgrid": "pairs,",
+        "brute": "pairs, sum and",
+    }
+    assert [name for name, what in wanted.items() if f"  {name:9} right: {what}" not in said] == []
+
+
+def test_command_refuses_what_it_does_not_know(capsys):
+    with pytest.raises(SystemExit, match="2"):
+        __main__.main(["--versoin"])
+    assert "unrecognized arguments: --versoin" in capsys.readouterr().err
+    with pytest.raises(SystemExit, match="0"):
+        __main__.main(["--version"])
+    assert capsys.readouterr().out == f"jfrnn {jfrnn.__version__}\n"
+
+
+def test_command_goes_on_where_an_engine_fails(monkeypatch, capsys):
+    def fail(backend, sums):
+        raise RuntimeError(f"{backend} breaks\nhere")
+
+    monkeypatch.setattr(__main__, "_is_right", fail)
+    assert __main__.main([]) == 1
+    said = capsys.readouterr().out
+    assert [f"  {name:9} FAILS, RuntimeError: {name} breaks\n" in said for name in ("jax", "brute")] == [True, True]
