@@ -70,7 +70,7 @@ def _make_file(url: str, name: str) -> None:
     corner = np.array([[0, 0, 0], [0, 2, 2], [2, 0, 2], [2, 2, 0]])
     atoms = np.concatenate([corner, corner + 1])  # of a cell of diamond, in quarters of its edge
     cells = np.stack(np.meshgrid(*[np.arange(4)] * 3, indexing="ij"), axis=-1).reshape(-1, 1, 3)
-    x = (cells + atoms / 4).reshape(-1, 3) * 5.431
+    x = (cells + atoms / 4).reshape(-1, 3) / 4  # fractions of the box of 4³ cells
     velocities = 2.98 * rng.standard_normal(x.shape)  # sqrt(kT/m) of silicon at 300 K [Å/ps]
     column = np.ones((len(x), 1))
     crystal = np.hstack([column, column, x, velocities - velocities.mean(0)])
