@@ -15,6 +15,7 @@ QUERY_CHUNK = 256  # and where it serves queries
 _HEADER_WORDS = 64
 MANY = 1 << 15  # sources from which several threads gather their coordinates
 FEW = 160  # sources up to which all are candidates of all queries
+ENTRIES = 16  # of the table, for each system with a box of its own, beyond those for its sources
 TOGETHER = 12  # queries that cells of a row are served for at once
 GRID = {
     "FEW": FEW,
@@ -28,7 +29,7 @@ def scratch_words(sources: int, queries: int, dim: int, width: int, own: bool, s
 
     `width` is 1 for float32 and 2 for float64; `systems` is how many there are with boxes of their own.
     """
-    table = table_cells(sources) + systems
+    table = table_cells(sources) + ENTRIES * systems
     parts = [_HEADER_WORDS, *[width * sources] * dim, sources, table + 2, max(sources, queries)]
     if not own:
         parts += [queries, table + 2]

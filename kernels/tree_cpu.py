@@ -34,7 +34,7 @@ def scratch_words(sources: int, queries: int, dim: int, width: int, own: bool, s
             break
         count = -(-count // FANOUT)
     most = max(sources, queries)
-    table = table_cells(sources) + systems + 2
+    table = table_cells(sources) + cells_cpu.ENTRIES * systems + 2
     parts = [64, *[width * sources] * dim, sources, table, most, queries, table]  # those of cells
     parts += [width * (sources + _MOST_LANES), sources + _MOST_LANES, sources, width * queries]
     parts += [*[width * (nodes + _MOST_LANES)] * (2 * dim + 1), most, most]

@@ -115,8 +115,8 @@ def _plan_on_cpu(variant: Variant, shapes: Shapes, _: int) -> Plan:
 
 
 def _with_table(numbers: dict[str, int], shapes: Shapes) -> dict[str, int]:
-    """Return the numbers of kernels of cells whose table has an entry more for each system."""
-    return numbers | {"table": numbers["table"] + shapes["cutoff"][0]}
+    """Return the numbers of kernels of cells whose table has some entries more for each system."""
+    return numbers | {"table": numbers["table"] + cells_cpu.ENTRIES * shapes["cutoff"][0]}
 
 
 def _sorting_on_cpu(variant: Variant | SumVariant, n: int) -> list[Launch]:

@@ -139,6 +139,8 @@ struct Sort : SortArguments, Places {
         return finite;
     }
 
+    // Of the table of a system, at least: rows of cells are no longer than half of that, so that they share entries at one end alone.
+    static constexpr int ENTRIES = 16;  // as in jfrnn/kernels/cells_cpu.py
     // Lays out the cells of each system, whose box is its own: those of one follow those of the one before it.
     void lay_out_boxes(Grid& grid) {
         for (unsigned int s = 0; s <= last_system; ++s) {
@@ -171,7 +173,7 @@ struct Sort : SortArguments, Places {
                 low[k] = of.sources ? of.grid.low[k] : real(0);
                 of.high[k] = of.sources ? of.high[k] : real(0);
             }
-            lay_out(of.grid, low, of.high, 1 + 4 * of.sources);
+            lay_out(of.grid, low, of.high, ENTRIES + 4 * of.sources);
             of.first_cell = grid.cells;
             grid.cells += of.grid.cells;
         }

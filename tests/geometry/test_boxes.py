@@ -372,3 +372,15 @@ def test_near_ties_of_particles_a_hundred_cells_away():
     assert listed_images(nbrs, jnp.asarray(x)) == expected
     near = {pair[:2] for pair in expected}
     assert 10 < sum((k, k + 1) in near for k in range(0, 120, 2)) < 50
+
+
+def test_systems_of_a_few_particles_in_wide_boxes():
+    rng = np.random.default_rng(5)
+    lengths, batch = rng.uniform(3, 9, 60), np.sort(rng.integers(0, 60, 240)).astype(np.int32)
+    x = rng.random((240, 3)) * lengths[batch, None]
+    boxes = jfrnn.Box(np.eye(3) * lengths[:, None, None], images=1)
+    apart = x[:, None] - x
+    apart -= np.rint(apart / lengths[batch, None, None]) * lengths[batch, None, None]
+    near = (np.linalg.norm(apart, axis=-1) < 1.2) & (batch[:, None] == batch) & ~np.eye(240, dtype=bool)
+    found = jfrnn.count(x, 1.2, box=boxes, batch=batch, backend="warp")
+    np.testing.assert_array_equal(found, near.sum(axis=1))
