@@ -364,7 +364,7 @@ X, H = np.zeros((4, 3), np.float32), np.ones(4, np.float32)
             lambda: jfrnn.search(X, H[:3]),
         ),
         (TypeError, "cutoff must be a number, or an array of floats with one per particle", lambda: jfrnn.search(X, H.astype(int))),
-        (TypeError, "cutoff must be a number, or an array of floats", lambda: jfrnn.search(X, [1.0] * 4)),
+        (TypeError, "cutoff must be a number, got str", lambda: jfrnn.search(X, "far")),
         (
             ValueError,
             r"cutoff must be a number, or have shape \[2\], one per query",
