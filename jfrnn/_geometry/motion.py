@@ -66,7 +66,7 @@ def _least_motion(moved: Array, among: tuple[Array, ...], lattice: Lattice) -> A
 
 def _nearest_planes(moved: Array, lattice: Lattice) -> Array:
     """Return lattice vectors near points [n, d], whole floats: plane by plane, from the last vector on (Babai 1986)."""
-    rows = [lattice.spread(lattice.matrix[..., k, :], 2) for k in range(lattice.dim)]
+    rows = [jnp.asarray(lattice.spread(lattice.matrix[..., k, :], 2)) for k in range(lattice.dim)]
     across: list[Array] = []  # what is orthogonal to the vectors before
     for row in rows:
         across.append(functools.reduce(lambda x, other: x - _along(x, other) * other, across, row))

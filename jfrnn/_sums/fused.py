@@ -183,7 +183,9 @@ def _ends(term: Term) -> Ends | None:
     for group, labels in zip(term.operands[1:], term.labels, strict=True):
         found += [before + k for k, label in enumerate(labels) if label in POSITIONS]
         before += len(group)
-    return Ends(0, *found, range(1, 1 + len(term.operands.shared))) if len(found) == 2 else None
+    if len(found) != 2:
+        return None
+    return Ends(0, found[0], found[1], range(1, 1 + len(term.operands.shared)))
 
 
 def _first_of(term: Term) -> int:

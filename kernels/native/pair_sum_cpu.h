@@ -15,10 +15,11 @@ struct SumArguments : SearchArguments {
 template <template <class> class Way>
 struct SumsBy : Way<SumsBy<Way>> {
     typedef Way<SumsBy<Way>> Base;
+    using Base::axis, Base::filled, Base::floats, Base::image, Base::inside, Base::n, Base::others_mask, Base::outside;
     using Base::band_at, Base::band_of, Base::candidate, Base::candidate_ids, Base::candidate_images, Base::candidates_at;
     using Base::collect_doubtful, Base::decided, Base::doubtful, Base::doubtful_at, Base::excluded, Base::excluded_starts;
-    using Base::axis, Base::filled, Base::floats, Base::image, Base::inside, Base::n, Base::others_mask, Base::outside;
-    using Base::queries, Base::several, Base::shared, Base::shift, Base::square_of, Base::sure, Base::sure_among, Base::sure_mask, Base::unsure, Base::wanted;
+    using Base::queries, Base::several, Base::shared, Base::shift, Base::square_of, Base::sure, Base::sure_among, Base::sure_mask,
+        Base::unsure, Base::wanted;
     static constexpr bool FLUSHED = !SCALED;  // where cutoffs are so small that they are scaled, so may be what decides
     alignas(64) real column[OTHERS + STEPS + 1][CANDIDATES + LANES];
     alignas(64) real near_points[PACKED ? 3 : 1][PACKED ? CANDIDATES + LANES : 1];
@@ -89,7 +90,7 @@ struct SumsBy : Way<SumsBy<Way>> {
     // AT_HOME: coordinates that the term reads are those of the candidates, and all steps are 0.
     template <bool AT_HOME>
     void meet_by(const real* q, int id, bool fresh, bool finished) {
-        const Term::Own own_part = 
+        const Term::Own own_part =
             term.own<AT_HOME>(own_values + (long long)id * OWN, q, turned() ? queries + (long long)id * ROW : nullptr);
         Reduction reduction(n);
         if constexpr (PACKED)
