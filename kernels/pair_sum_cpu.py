@@ -2,7 +2,7 @@
 
 `jfrnn.kernels.cells_cpu` sorts the sources by cell (`build`). `sort_values` puts what a term reads of them into the same order, a
 column each; then `query` walks over all queries as a search does, with these columns beside the coordinates of the candidates. In a
-periodic box turns stand behind what is read of i and j, packed as in `jfrnn._box`: with the image of a candidate they make S.
+periodic box, positions and turns, which make S with the image of a candidate, are read of rows of particles, and have no columns.
 Sums stay in vector registers while the pairs of one query are added. Terms of few operations are evaluated for all candidates of
 a vector, others for those that are near, which are packed first. In place of sums `query` can find the largest summands, and whose
 they are.
@@ -64,7 +64,8 @@ class TermText(NamedTuple):
     """A term as native text: `text` defines the `sums` from what it reads, of S, of what all pairs share, of i and of j.
 
     A column of numbers stands for each value of the last three, and with `steps` one of turns behind those of i and of j. The
-    `first` ones of the sums of each i stand in an array of their own; 0: all stand in one.
+    `first` ones of the sums of each i stand in an array of their own; 0: all stand in one. `unshifted` is the text for S = 0 of a
+    term that reads S, and positions, for nothing but x_j - x_i + S·A; otherwise it is empty.
     """
 
     text: str
@@ -74,6 +75,7 @@ class TermText(NamedTuple):
     others: tuple[Value, ...]
     sums: tuple[Sum, ...]
     first: int = 0
+    unshifted: str = ""
 
     @property
     def columns(self) -> int:
@@ -85,6 +87,29 @@ class TermText(NamedTuple):
         """How many columns are read of the sources."""
         return self.columns + bool(self.steps)
 
+    @property
+    def other_columns(self) -> list[int]:
+        """Which columns of j hold what rows of particles do not."""
+        return _beside_rows(self.others)
+
+    @property
+    def own_columns(self) -> list[int]:
+        """Which columns of i do so."""
+        return _beside_rows(self.own)
+
+    @property
+    def reads_rows(self) -> int:
+        """Of j, whether it reads what rows of particles in a box hold, positions and turns: 1, or 2 where any turn is not -1, 0, 1.
+
+        The displacement of particles that lie in the boxes beside is that of wrapped positions, hardly rounded.
+        """
+        reads = bool(self.steps) or any(value.column_axis is not None for value in self.others)
+        return reads * (1 + bool(self.unshifted))
+
+
+def _beside_rows(values: tuple[Value, ...]) -> list[int]:
+    return [k for k, value in enumerate(value for value in values if value.axis is None) if value.column_axis is None]
+
 
 def slots(queries: int) -> int:
     """Return the number of partial sums that make up a sum over all pairs."""
@@ -92,9 +117,10 @@ def slots(queries: int) -> int:
 
 
 def sorted_numbers(term: TermText, sources: int, dim: int, double: bool) -> int:
-    """Return how many numbers the sorted values of all sources take: one of each for each column, and behind them a vector."""
-    del dim, double
-    return sources * term.source_columns + (MOST_LANES if term.source_columns else 0)
+    """Return how many numbers the sorted values of all sources take: columns, those of what is read of rows, and a vector."""
+    del double
+    columns = len(term.other_columns) + (dim + 1 if term.reads_rows else 0)
+    return sources * columns + (MOST_LANES if columns else 0)
 
 
 def load_value(value: Value, lanes: str, bits: str, double: bool) -> str:
@@ -123,22 +149,25 @@ def place_values(values: tuple[Value, ...], column: str, axis: str) -> list[str]
     return [column.format(next(numbers)) if value.axis is None else axis.format(value.axis) for value in values]
 
 
-def constants_of(term: TermText, compensated: bool, extremes: bool, turned: bool = True) -> dict[str, int]:
+def constants_of(term: TermText, compensated: bool, extremes: bool, turned: bool = True, by_rows: bool = False) -> dict[str, int]:
     """Return the named integers that a program with a term needs, but for CANDIDATES, how many pairs are held.
 
-    `turned`: a column of turns stands behind those of i, if the term reads lattice shifts.
+    `turned`: a column of turns stands behind those of i, if the term reads lattice shifts. `by_rows`: rows of particles hold these,
+    and positions in a box.
     """
     totals = sum(part.total for part in term.sums)
     found = {"OTHERS": term.columns, "STEPS": len(term.steps), "TOTALS": totals, "ROW_SUMS": len(term.sums) - totals}
     found["FIRST_SUMS"] = term.first or found["ROW_SUMS"]
     own = sum(value.axis is None for value in term.own) + (turned and bool(term.steps))
+    own = len(term.own_columns) if by_rows else own
     return found | {"OWN": own, "COMPENSATED": compensated, "SUMS": 1 + extremes}
 
 
-def term_header(term: TermText, double: bool, turned: bool = True) -> dict[str, str]:
+def term_header(term: TermText, double: bool, turned: bool = True, by_rows: bool = False) -> dict[str, str]:
     """Return the header of a program with a term: `term.h` holds the struct `Term`, as in the example of that name.
 
-    `turned`: the lattice shift of a pair is what stands in its columns, and turns of i are added to that.
+    `turned`: the lattice shift of a pair is what stands in its columns, and turns of i are added to that. `by_rows`: these turns,
+    and positions of i in a box, are those of its row of particles.
     """
     order = [itertools.count(), itertools.count()]
     places = [next(order[part.total]) for part in term.sums]
@@ -149,12 +178,19 @@ def term_header(term: TermText, double: bool, turned: bool = True) -> dict[str, 
     lines += [f"JFRNN_TABLE bool MARKED[] = {{{', '.join(marks or ['0'])}}};"]
     axes = [str(-1 if value.column_axis is None else value.column_axis) for value in term.others if value.axis is None]
     lines += [f"JFRNN_TABLE int COLUMN_AXES[] = {{{', '.join(axes or ['-1'])}}};"]
+    lines += [f"JFRNN_TABLE int COLUMN_NUMBERS[] = {{{', '.join(_numbers(axes))}}};"]
     lines += [f"JFRNN_TABLE int STEP_AXES[] = {{{', '.join([str(step.axis) for step in term.steps] or ['0'])}}};"]
     lines += ["struct Term {", *_members(term.shared), "struct Own {", *_members(term.own)]
     lines += [*(f"number turned{c};" for c in range(len(term.steps) if turned else 0)), "};"]
-    lines += [*_of_shared(term, double), *_of_own(term, double, turned)]
-    text = "\n".join([*lines, *_evaluation(term, double, turned), "};", ""])
+    lines += [*_of_shared(term, double), *(_own_by_rows(term, double) if by_rows else _of_own(term, double, turned))]
+    text = "\n".join([*lines, *_evaluation(term, double, turned, by_rows), "};", ""])
     return {"term.h": '#include "lattice.h"\n#include "math.h"\n' + text}
+
+
+def _numbers(axes: list[str]) -> list[str]:
+    """Return which of the columns that are no coordinates each one is, -1: it is one."""
+    numbers = itertools.count()
+    return [str(next(numbers)) if axis == "-1" else "-1" for axis in axes] or ["-1"]
 
 
 def _members(values: tuple[Value, ...]) -> list[str]:
@@ -168,28 +204,38 @@ def _of_shared(term: TermText, double: bool) -> list[str]:
 
 
 def _of_own(term: TermText, double: bool, turned: bool) -> list[str]:
-    """Return the lines that read what is known of a query at `q`, of its row of numbers; AT_HOME it has no turns."""
-    given = [
-        (value, at if value.column_axis is None else f"(AT_HOME ? q[{value.column_axis}] : {at})")
-        for value, at in zip(term.own, place_values(term.own, "row[{}]", "q[{}]"), strict=True)
-    ]
-    lines = [f"own.{value.name} = {_spread(value, at, double)};" for value, at in given]
+    """Return the lines that read what is known of a query at `q`, of its row of numbers."""
     column = sum(value.axis is None for value in term.own)
-    turns = [f"AT_HOME ? real(0) : real(Lattice::turn(row[{column}], {step.axis}))" for step in term.steps if turned]
+    turns = [f"real(Lattice::turn(row[{column}], {step.axis}))" for step in term.steps if turned]
+    places = place_values(term.own, "row[{}]", "q[{}]")
+    return ["JFRNN_MEMBER Own own(const real* row, const real* q) const {", *_assign_own(term, places, turns, double)]
+
+
+def _own_by_rows(term: TermText, double: bool) -> list[str]:
+    """Return the lines that read it where positions and turns are those of a row of particles, if there is one."""
+    numbers, places = itertools.count(), []
+    for value in term.own:
+        axis = value.column_axis
+        given = (
+            f"row[{next(numbers)}]"
+            if axis is None and value.axis is None
+            else f"(AT_HOME || !particle ? q[{axis}] : particle[{axis}])"
+        )
+        places.append(given if value.axis is None else f"q[{value.axis}]")
+    turns = [f"AT_HOME || !particle ? real(0) : real(Lattice::turn(particle[DIM], {step.axis}))" for step in term.steps]
+    head = ["template <bool AT_HOME>", "JFRNN_MEMBER Own own(const real* row, const real* q, const real* particle) const {"]
+    return [*head, *_assign_own(term, places, turns, double)]
+
+
+def _assign_own(term: TermText, places: list[str], turns: list[str], double: bool) -> list[str]:
+    lines = [f"own.{value.name} = {_spread(value, at, double)};" for value, at in zip(term.own, places, strict=True)]
     lines += [f"own.turned{c} = Math::of({x});" for c, x in enumerate(turns)]
-    return [
-        "template <bool AT_HOME = false>",
-        "JFRNN_MEMBER Own own(const real* row, const real* q) const {",
-        "Own own;",
-        *lines,
-        "return own;",
-        "}",
-    ]
+    return ["Own own;", *lines, "return own;", "}"]
 
 
-def _evaluation(term: TermText, double: bool, turned: bool) -> list[str]:
-    """Return the lines that evaluate a term for a vector of pairs."""
-    lines = ["template <class Column>"]
+def _evaluation(term: TermText, double: bool, turned: bool, by_rows: bool) -> list[str]:
+    """Return the lines that evaluate a term for a vector of pairs; `by_rows` in two ways, of which one is AT_HOME."""
+    lines = ["template <bool AT_HOME, class Column>" if by_rows else "template <class Column>"]
     lines += ["JFRNN_MEMBER void evaluate(const Own& own, const number* p, Column column, number* summand) const {"]
     lines += [f"const Math::{_NAMES[value.dtype]} {value.name} = own.{value.name};" for value in term.own]
     numbers = place_values(term.others, "column({})", "p[{}]")
@@ -197,12 +243,18 @@ def _evaluation(term: TermText, double: bool, turned: bool) -> list[str]:
     for c, step in enumerate(term.steps):
         shift = f"column({term.columns + c})" + f" + own.turned{c}" * turned
         lines.append(f"const number {step.name} = SHIFTED ? {shift} : number{{}};")
-    return [*lines, term.text, *(f"summand[{k}] = {part.name};" for k, part in enumerate(term.sums)), "}"]
+    put = [f"summand[{k}] = {part.name};" for k, part in enumerate(term.sums)]
+    if by_rows and term.unshifted:
+        lines += ["if constexpr (AT_HOME) {", term.unshifted, *put, "return;", "}"]
+    return [*lines, term.text, *put, "}"]
 
 
 @functools.cache
 def sort_kernel(dim: int, double: bool) -> Kernel:
-    """Return the kernel that puts values of the sources [n, width] in the order of cells: columns [width * n]."""
+    """Return the kernel that puts values of the sources [n, width] in the order of cells: columns [width * n].
+
+    Behind these stand columns of the coordinates and turns of the sources, if `reads_rows`, where any particle has turns.
+    """
     constants: dict[str, int] = {**GRID, "CHUNK": CHUNK, "MANY": 0}
     text = program(double, dim, "sort_values.h", **constants)
     return declare(f"sort_values_{dim}d_{'f64' if double else 'f32'}", text, "SortValues.run")[0]
@@ -233,13 +285,16 @@ def query_kernel(
     `packed`: the term is evaluated for what is near alone, not for other candidates; None: as is faster.
     `rule`: one of `RULES`, where cutoffs differ; then sources stand in a tree (`jfrnn.kernels.tree_cpu`).
     """
-    packed = work(term.text) > LITTLE_WORK if packed is None else packed
+    operations = work(term.unshifted or term.text)
+    packed = operations > LITTLE_WORK if packed is None else packed
     variant = f"{dim}d_{'f64' if double else 'f32'}{'_scaled' * scaled}{'_compensated' * compensated}"
     variant += (
         f"{SPACES[periodic]}{BATCHES[batched]}{'_extremes' * extremes}{'_excluding' * excluding}{'_' * bool(rule)}{rule}_{key}"
     )
-    constants = {"SCALED": scaled, "LIST": 0, **GRID, **constants_of(term, compensated, extremes)}
+    constants = {"SCALED": scaled, "LIST": 0, **GRID, **constants_of(term, compensated, extremes, by_rows=True)}
     constants |= {
+        "COLUMNS": len(term.other_columns),
+        "READS_ROWS": term.reads_rows,
         "PERIODIC": periodic,
         "BATCHED": batched,
         "EXCLUDING": excluding,
@@ -247,9 +302,9 @@ def query_kernel(
         "QUERY_CHUNK": QUERY_CHUNK,
         "CANDIDATES": _candidates(term, dim, double),
     }
-    works = work(term.text) > VERY_LITTLE_WORK
+    works = operations > VERY_LITTLE_WORK
     constants |= {"MANY": 0, "PACKED": packed, "SKIPPED": works, "TOGETHER": TOGETHER_AT_WORK if works else TOGETHER}
-    given = term_header(term, double)
+    given = term_header(term, double, by_rows=True)
     if rule:
         constants |= tree_cpu.constants_of(rule)
         given |= tree_cpu.PROVIDER

@@ -18,7 +18,7 @@ from jfrnn._engine.operands import (
 )
 from jfrnn._engine.plans import Clear, Launch, Plan, share
 from jfrnn._engine.problem import Filter, Room, Rows, Search, largest_radius
-from jfrnn._engine.sum_results import FoundSums, SumsOf
+from jfrnn._engine.sum_results import FoundSums, SumsOf, beside_rows, numbers_of_values
 from jfrnn._engine.variants import (
     SumVariant,
     Variant,
@@ -232,10 +232,10 @@ def box_sums(
         kind = compensated, extremes, key, cuda, False, search.excluding, _rule_of(search)
         return SumVariant(dim, double, cutoff.scaled, *flags, *kind)
 
-    def on_cpu(search: Search, shared: Array, own: Array, others: Array) -> FoundSums:
+    def on_cpu(search: Search, *values: Array) -> FoundSums:
         results, scratch = SumsOf(term, m, pair_sum_cpu.slots(m), compensated, extremes), _scratch_dims(search)
         dims = results.dims() | {"columns": max(pair_sum_cpu.sorted_numbers(term, n, dim, double), 1), "info": 2} | scratch
-        given = [*_particles(search), shared, own, others, *excluded_rows(search), *_cutoffs_of_particles(search)]
+        given = [*_particles(search), *beside_rows(term, values), *excluded_rows(search), *_cutoffs_of_particles(search)]
         return results.unpack(*_cpu_sum_callable(variant_on(False), term)(*given, output_dims=dims)[: len(_SUMS)])
 
     def on_cuda(search: Search, shared: Array, own: Array, others: Array) -> FoundSums:
@@ -278,8 +278,8 @@ def _plan_sums_on_cpu(variant: SumVariant, term: TermText, shapes: Shapes, _: in
     kind = variant.dim, variant.double, variant.scaled, variant.compensated
     more = {"periodic": variant.periodic, "batched": OWN_BOXES, "extremes": variant.extremes, "excluding": variant.excluding}
     query = pair_sum_cpu.query_kernel(term, variant.key, *kind, **more, rule=variant.rule)
-    flags = {"closed": variant.closed, "drop_self": variant.drop_self, "width": term.source_columns}
-    numbers = _with_table(size_numbers(shapes, variant.own), shapes) | flags
+    flags = {"closed": variant.closed, "drop_self": variant.drop_self}
+    numbers = _with_table(size_numbers(shapes, variant.own), shapes) | flags | numbers_of_values(term, shapes)
     values = [share(pair_sum_cpu.sort_kernel(variant.dim, variant.double), numbers["n"])] if term.source_columns else []
     return Plan([*_sorting_on_cpu(variant, numbers["n"]), *values, share(query, numbers["m"])], numbers)
 

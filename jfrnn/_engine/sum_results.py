@@ -1,5 +1,6 @@
 """The arrays into which kernels write sums, and the sums in them."""
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -50,3 +51,21 @@ def _add_parts(parts: Array) -> Array:
     """Add partial sums [slots, 2, width], values and errors, in twice the precision."""
     zero = jnp.zeros((), parts.dtype)
     return rounded_sum(*lax.reduce((parts[:, 0], parts[:, 1]), (zero, zero), compensated_sum, (0,)))
+
+
+def beside_rows(term: TermText, values: tuple[Array, ...]) -> tuple[Array, Array, Array]:
+    """Return values without columns of i and of j that rows of particles hold, too: kernels of the CPU read them there."""
+
+    def take(columns: list[int], given: Array) -> Array:
+        if columns == list(range(given.shape[1])):
+            return given
+        found = [given[:, k : k + 1] for k in columns]
+        return jnp.concatenate(found, axis=1) if found else jnp.zeros((1, 1), given.dtype)
+
+    shared, own, others = values
+    return shared, take(term.own_columns, own), take(term.other_columns, others)
+
+
+def numbers_of_values(term: TermText, shapes: Mapping[str, tuple[int, ...]]) -> dict[str, int]:
+    """Return the numbers of the kernel of the CPU that sorts such values and, where they are read, what rows of particles hold."""
+    return {"width": len(term.other_columns), "reads_rows": term.reads_rows, "row_numbers": shapes["positions"][1]}

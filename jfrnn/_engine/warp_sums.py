@@ -12,7 +12,7 @@ from jfrnn._engine.launch import Call, Shapes, kernel
 from jfrnn._engine.operands import cutoffs_of_particles, excluded_rows, orders_for_tree, pack_particles, periodic_kind
 from jfrnn._engine.plans import Launch, Plan, share
 from jfrnn._engine.problem import Filter, Search
-from jfrnn._engine.sum_results import FoundSums, SumsOf, TermText
+from jfrnn._engine.sum_results import FoundSums, SumsOf, TermText, beside_rows, numbers_of_values
 from jfrnn._engine.variants import SumVariant, names_of_particles, names_of_tree, size_numbers
 from jfrnn._engine.warp import QUERIES_PER_THREAD, are_few, by_cells_or_tree, fit_tree, place_launches, sort_on_cpu
 from jfrnn._geometry import Cutoffs
@@ -52,6 +52,7 @@ def pair_sums(
             kind = (compensated, extremes, key, cuda, cuda and not rule and are_few(search), search.excluding, rule, tree)
             variant = SumVariant(sources.shape[1], sources.dtype == jnp.float64, cutoff.scaled, *flags, *kind)
             of_particles = cutoffs_of_particles(cutoff) if isinstance(cutoff, Cutoffs) else {}
+            values = values if cuda else beside_rows(term, values)
             more = [*excluded_rows(search), *of_particles.values()]
             orders = [*of_particles.values(), *orders_for_tree(search).values()] if tree else []
             return _call_sums(variant, term, pack_particles(search), values, more, orders)
@@ -155,7 +156,7 @@ def _plan_on_cpu(variant: SumVariant, term: TermText, shapes: Shapes, multiproce
     space = _space(variant)
     more = space | {"extremes": variant.extremes, "excluding": variant.excluding, "rule": variant.rule}
     query = pair_sum_cpu.query_kernel(term, variant.key, dim, double, scaled, variant.compensated, **more)
-    numbers = _numbers(variant, term, shapes)
+    numbers = _numbers(variant, term, shapes) | numbers_of_values(term, shapes)
     values = [share(pair_sum_cpu.sort_kernel(dim, double), numbers["n"])] if term.source_columns else []
     if variant.rule:
         sort = sort_on_cpu(tree_cpu.sort_kernels(dim, double, variant.rule, **space), numbers["n"])

@@ -203,7 +203,8 @@ def translation(shifts: Array, lattice: Lattice) -> Array:
     if lattice.images.orthogonal:
         return shifts * lattice.spread(_diagonal(lattice.matrix), shifts.ndim)
     rows = [lattice.spread(lattice.matrix[..., k, :], shifts.ndim) for k in range(lattice.dim)]
-    return sum((shifts[..., k, None] * rows[k] for k, p in enumerate(lattice.images.periodic) if p), jnp.zeros_like(shifts))
+    moves = [shifts[..., k, None] * rows[k] for k, p in enumerate(lattice.images.periodic) if p]
+    return functools.reduce(jnp.add, moves) if moves else jnp.zeros_like(shifts)
 
 
 def shift_pairs(difference: Array, shifts: Array, lattice: Lattice) -> Shifted:

@@ -1,6 +1,7 @@
 """Motion: how far particles have moved since a list was made, and how far a change of the box moved periodic images."""
 
 import dataclasses
+import functools
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -45,8 +46,41 @@ def motion_of(before: Array, now: Array, lattice: Lattice) -> Motion:
 
 def turns_between(before: Array, now: Array, lattice: Lattice) -> Array:
     """Count the lattice vectors by which points [n, d] were translated, as by wrapping: whole floats, 0 along open axes."""
-    before, now = lax.stop_gradient((before, now))
-    return -nearest_shifts(jnp.where(jnp.isfinite(now - before).all(axis=1, keepdims=True), now - before, 0), lattice)
+    before, now, fixed = lax.stop_gradient((before, now, lattice))
+    moved = jnp.where(jnp.isfinite(now - before).all(axis=1, keepdims=True), now - before, 0)
+    turns = -nearest_shifts(moved, fixed)
+    return turns if lattice.images.orthogonal else _least_motion(moved, (turns, _nearest_planes(moved, fixed), 0 * turns), fixed)
+
+
+def _least_motion(moved: Array, among: tuple[Array, ...], lattice: Lattice) -> Array:
+    """Return the translations that leave the shortest motion; those that come first, where others are no better.
+
+    In a box that is far from reduced, the fractional coordinates of a short motion are long.
+    """
+    rests = [jnp.sum((moved - translation(turns, lattice)) ** 2, axis=1, keepdims=True) for turns in among]
+    best, least = among[0], rests[0]
+    for turns, rest in zip(among[1:], rests[1:], strict=True):
+        best, least = jnp.where(rest < least, turns, best), jnp.minimum(rest, least)
+    return best
+
+
+def _nearest_planes(moved: Array, lattice: Lattice) -> Array:
+    """Return lattice vectors near points [n, d], whole floats: plane by plane, from the last vector on (Babai 1986)."""
+    rows = [jnp.asarray(lattice.spread(lattice.matrix[..., k, :], 2)) for k in range(lattice.dim)]
+    across: list[Array] = []  # what is orthogonal to the vectors before
+    for row in rows:
+        across.append(functools.reduce(lambda x, other: x - _along(x, other) * other, across, row))
+    turns, rest = [], moved
+    for row, normal in zip(reversed(rows), reversed(across), strict=True):
+        turns.append(jnp.round(_along(rest, normal)))
+        rest = rest - turns[-1] * row
+    return jnp.concatenate(turns[::-1], axis=1)
+
+
+def _along(points: Array, normal: Array) -> Array:
+    """Return how often a vector fits into points along it, [n, 1]; 0 for a vector of length 0."""
+    square = jnp.sum(normal**2, axis=-1, keepdims=True)
+    return jnp.sum(points * normal, axis=-1, keepdims=True) / jnp.where(square > 0, square, 1)
 
 
 def box_change(before: Lattice, now: Lattice, spans: Array) -> Array:

@@ -33,7 +33,7 @@ from jfrnn._geometry import unpack_turns
 from jfrnn._search import kept_shifts
 from jfrnn._sums.scalars import NoTranslationError, hash_of
 from jfrnn._sums.terms import POSITIONS, Groups, Term, join
-from jfrnn._sums.translate import input_name, output_name, translate
+from jfrnn._sums.translate import Ends, input_name, output_name, translate
 from jfrnn.kernels.pair_sum_cpu import Step, Sum, TermText, Value
 
 _Columns = tuple[tuple[int, int], ...]  # per column: the operand of a group and the element of it
@@ -149,9 +149,9 @@ def make_plan(term: Term, dtype: np.dtype, periodic: tuple[bool, ...], negated: 
         summands = term(jnp.asarray(True), jnp.where(np.array(periodic), shift, 0), operands)
         return [-x for x in summands] if negated else summands
 
-    translated = translate(jax.make_jaxpr(of_pair)(term.shift, term.operands))
-    steps = tuple(Step(input_name(k, e), e) for k, e in translated.reads if k == 0)
     wrapped = any(periodic) and not listed  # kernels of cells hold wrapped positions, so that those that were given have columns
+    translated = translate(jax.make_jaxpr(of_pair)(term.shift, term.operands), _ends(term) if wrapped else None)
+    steps = tuple(Step(input_name(k, e), e) for k, e in translated.reads if k == 0)
     columns, values, before = [], [], 1
     for group, labels in zip(term.operands, ((), *term.labels), strict=True):
         reads = [(k - before, e) for k, e in translated.reads if before <= k < before + len(group)]
@@ -169,11 +169,23 @@ def make_plan(term: Term, dtype: np.dtype, periodic: tuple[bool, ...], negated: 
         for k, (spec, total, mark) in enumerate(zip(translated.outputs, term.totals, term.marks, strict=True))
         for e in range(math.prod(spec.shape))
     )
-    text = TermText(translated.text, steps, values[0], values[1], values[2], sums, 0 if listed else _first_of(term))
+    first = 0 if listed else _first_of(term)
+    text = TermText(translated.text, steps, values[0], values[1], values[2], sums, first, translated.unshifted)
     turns = [
         ((len(group), 0),) if steps and not listed else () for group in term.operands
     ]  # the columns of turns follow those of the operands
     return Plan(text, columns[0], columns[1] + turns[1], columns[2] + turns[2], hash_of(tuple(text), dtype.name)[:20])
+
+
+def _ends(term: Term) -> Ends | None:
+    """Return which inputs of a translated term are the shift and the positions of i and of j; None: it lacks some."""
+    before, found = 1 + len(term.operands.shared), []
+    for group, labels in zip(term.operands[1:], term.labels, strict=True):
+        found += [before + k for k, label in enumerate(labels) if label in POSITIONS]
+        before += len(group)
+    if len(found) != 2:
+        return None
+    return Ends(0, found[0], found[1], range(1, 1 + len(term.operands.shared)))
 
 
 def _first_of(term: Term) -> int:

@@ -4,7 +4,7 @@ Nodes are numbered, operands before their results, so ascending numbers are an o
 """
 
 import hashlib
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -105,15 +105,15 @@ class Scalars:
         """Return the value of a constant, None for other nodes."""
         return self.nodes[number].value
 
-    def dependencies(self, outputs: Iterable[int]) -> set[int]:
-        """Return all nodes on which the outputs depend, themselves included."""
+    def dependencies(self, outputs: Iterable[int], instead: Mapping[int, Iterable[int]] | None = None) -> set[int]:
+        """Return all nodes on which the outputs depend, themselves included; some have other operands `instead` of theirs."""
         found: set[int] = set()
-        left = list(outputs)
+        left, operands = list(outputs), instead or {}
         while left:
             number = left.pop()
             if number not in found:
                 found.add(number)
-                left.extend(self.nodes[number].operands)
+                left.extend(operands.get(number, self.nodes[number].operands))
         return found
 
     def latest_input(self, number: int) -> int:
@@ -121,10 +121,13 @@ class Scalars:
         inputs = (k for k in self.dependencies([number]) if not self.nodes[k].operands and self.nodes[k].value is None)
         return max(inputs, default=-1)
 
-    def text(self, outputs: dict[str, int]) -> str:
-        """Return the statements that define the outputs by name, without unused ones."""
-        names, lines = {}, []
-        for number in sorted(self.dependencies(outputs.values())):
+    def text(self, outputs: dict[str, int], same: Mapping[int, int] | None = None) -> str:
+        """Return the statements that define the outputs by name, without unused ones; `same`: nodes and equal ones before."""
+        names, lines, same = {}, [], same or {}
+        for number in sorted(self.dependencies(outputs.values(), {k: (other,) for k, other in same.items()})):
+            if number in same:
+                names[number] = names[same[number]]
+                continue
             node = self.nodes[number]
             names[number] = node.form.format(*(names[k] for k in node.operands))
             if node.operands:  # inputs and constants are written inline

@@ -34,7 +34,7 @@ class Translated(NamedTuple):
 
     `text` is a piece of a function body. For each (k, e) in `reads` it needs `input_name(k, e)`, element e of input k, in the type
     that `Math` has for its dtype; it defines `output_name(k, e)` for every element of every output. `key` is a hash of all of this,
-    the same in every process.
+    the same in every process. `unshifted` is the text for shifts of 0, if that was asked for (`Ends`), and there is one.
     """
 
     text: str
@@ -42,6 +42,16 @@ class Translated(NamedTuple):
     outputs: tuple[Spec, ...]
     reads: tuple[tuple[int, int], ...]
     key: str
+    unshifted: str = ""
+
+
+class Ends(NamedTuple):
+    """Which inputs of a function are the shift of a pair, the positions of i and of j, and those that are of neither."""
+
+    shift: int
+    mine: int
+    theirs: int
+    shared: range
 
 
 def input_name(k: int, e: int) -> str:
@@ -54,12 +64,13 @@ def output_name(k: int, e: int) -> str:
     return f"out{k}_{e}"
 
 
-def translate(closed: ClosedJaxpr) -> Translated:
+def translate(closed: ClosedJaxpr, ends: Ends | None = None) -> Translated:
     """Translate a closed jaxpr into native text.
 
     Args:
         closed: A result of `jax.make_jaxpr`, with arrays of float32, float64, int32, int64 or bool, each of at most MOST_ELEMENTS
             elements.
+        ends: Tells positions and shift, of which there may be a text without shifts (`_displacements`).
 
     Returns:
         The text, its inputs and its outputs.
@@ -77,7 +88,27 @@ def translate(closed: ClosedJaxpr) -> Translated:
     defined = {name: better[number] for name, number in defined.items()}
     text = scalars.text(defined)
     reads = tuple(places[number] for number in sorted(scalars.dependencies(defined.values()) & places.keys()))
-    return Translated(text, inputs, outputs, reads, hash_of(text, inputs, outputs))
+    same = {} if ends is None else _displacements(scalars, arguments, defined, ends)
+    unshifted = scalars.text(defined, same) if same else ""
+    return Translated(text, inputs, outputs, reads, hash_of(text, inputs, outputs), unshifted)
+
+
+def _displacements(scalars: Scalars, arguments: list[Values], defined: dict[str, int], ends: Ends) -> dict[int, int]:
+    """Return the components of x_j - x_i + S·A, each with the node for x_j - x_i; none, if S or positions are read elsewhere."""
+    mine, theirs, shift = (arguments[k].reshape(-1).tolist() for k in (ends.mine, ends.theirs, ends.shift))
+    of_neither = {*shift, *(number for k in ends.shared for number in arguments[k].reshape(-1).tolist())}
+    inputs = {number for values in arguments for number in values.reshape(-1).tolist()}
+    used, same = scalars.dependencies(defined.values()), {}
+    for x_i, x_j in zip(mine, theirs, strict=True):
+        difference = scalars.find("sub", (x_j, x_i), scalars.nodes[x_j].dtype)
+        for number in used:
+            node = scalars.nodes[number]
+            if node.operation == "add" and difference in node.operands:
+                others = [k for k in node.operands if k != difference]
+                if scalars.dependencies(others) & inputs <= of_neither:
+                    same[number] = difference
+    left = scalars.dependencies(defined.values(), dict.fromkeys(same, ()))
+    return {} if left & {*mine, *theirs, *shift} else same
 
 
 def translate_scalars(closed: ClosedJaxpr) -> tuple[Scalars, list[Values], list[Values]]:

@@ -9,7 +9,7 @@ struct Shared {
     int next_chunk;
     int next_gathered, next_sorted;  // chunks of sources whose coordinates and values are put in order
     int gathered;                    // sources that are
-    int turned;                      // whether any particle lies outside of the cell of a periodic box
+    int turned;                      // of a periodic box: 0 if all particles lie in its cell, 1 if in those beside it, else 2
     real unit;                       // of the lattice on which all coordinates lie, or 0
     real cells_for;                  // where cutoffs differ: that for which cells are wide, or 0: sources stand in a tree
 };
@@ -105,7 +105,8 @@ struct Sort : SortArguments, Places {
         }
         shared.next_chunk = 0;
         shared.next_gathered = shared.next_sorted = 0;
-        info[0] = shared.turned = 0;
+        info[0] = 0;
+        note_turns();
         int lowest = 1 << 20, highest = 0;
         look_at_bits(positions, n, lowest, highest);
         if (!own)
@@ -203,22 +204,36 @@ struct Sort : SortArguments, Places {
     // Notes the cell of each point, and how many points each cell has two entries behind its own.
     void count_cells(const Grid& grid, const real* points, int count, int* first) {
         int* const key = this->key;  // stays in a register, whatever is stored
-        int turned = 0;
         for (int c = 0; c < grid.cells + 2; ++c)
             first[c] = 0;
         for (int i = 0; i < count; ++i) {
             real p[3];
             enter(system_of(points + (long long)ROW * i));
             point_of(points + (long long)ROW * i, p);
-            if constexpr (PERIODIC)
-                turned |= Lattice::packed_turns(points[(long long)ROW * i + DIM]) != Lattice::NONE;
             const Grid& there = BOXES ? grid_of[here].grid : grid;
             const int cell = finite_point(p) ? first_cell() + cell_key(there, p, system_of(points + (long long)ROW * i)) : -1;
             key[i] = cell;
             if (cell >= 0)
                 ++first[cell + 2];
         }
-        shared.turned |= turned;
+    }
+    // Notes how far away from the cell any of the points lies. Those that are not finite have negative turns, and no pairs.
+    void note_turns(const real* points, int count) {
+        int turned = 0, far = 0;
+        for (int i = 0; PERIODIC && i < count; ++i) {
+            const int packed = Lattice::packed_turns(points[(long long)ROW * i + DIM]);
+            turned |= packed >= 0 && packed != Lattice::NONE;
+            for (int k = 0; k < DIM; ++k)
+                far |= packed >= 0 && (unsigned int)(((packed >> (10 * k)) & 1023) - 511) > 2u;
+        }
+        const int most = far ? 2 : turned;
+        shared.turned = most > shared.turned ? most : shared.turned;
+    }
+    void note_turns() {
+        shared.turned = 0;
+        note_turns(positions, n);
+        if (!own)
+            note_turns(queries, m);
     }
     // Coordinates of few sources are put in order at once, those of many by several threads (`gather`).
     int put_in_cells(const Grid& grid, const real* points, int count, int* first, int* order, bool with_axes) {

@@ -18,7 +18,7 @@ struct CutoffSort : TreeSortArguments {
 
     void build() {
         Shared& shared = cells.shared;
-        shared.next_chunk = shared.next_gathered = shared.next_sorted = shared.gathered = shared.turned = 0;
+        shared.next_chunk = shared.next_gathered = shared.next_sorted = shared.gathered = 0;
         shared.unit = shared.cells_for = 0;
         info[0] = 0;
         if constexpr (BOXES) {  // by cells that are wide enough for the largest cutoff of each system
@@ -26,7 +26,10 @@ struct CutoffSort : TreeSortArguments {
             shared.cells_for = 1;
             if (n < MANY)
                 TreePlaces(*this).put_in_order(0, n);
-        } else if (!sort_by_cells())
+            return;
+        }
+        cells.note_turns();
+        if (!sort_by_cells())
             tree();
     }
     __attribute__((noinline)) void tree() { TreeSort(*this).build(); }

@@ -9,15 +9,17 @@ struct SumArguments : SearchArguments {
 };
 
 // What the term reads of the sources stands in `columns`, in the order of cells; columns of the candidates lie beside their
-// coordinates. In a periodic box turns stand behind what is read of i and j, packed as in jfrnn/_geometry/box.py: with the image of a
-// candidate they make the lattice shift of the pair, a step along each axis.
+// coordinates. In a periodic box positions as they are given, and turns, are read of rows of particles. Behind the other columns stand
+// those of the sources, if any particle has turns. With the image of a candidate, turns make the lattice shift of the pair, a step
+// along each axis.
 template <template <class> class Way>
 struct SumsBy : Way<SumsBy<Way>> {
     typedef Way<SumsBy<Way>> Base;
+    using Base::axis, Base::filled, Base::floats, Base::image, Base::inside, Base::n, Base::others_mask, Base::outside;
     using Base::band_at, Base::band_of, Base::candidate, Base::candidate_ids, Base::candidate_images, Base::candidates_at;
     using Base::collect_doubtful, Base::decided, Base::doubtful, Base::doubtful_at, Base::excluded, Base::excluded_starts;
-    using Base::filled, Base::floats, Base::image, Base::inside, Base::n, Base::others_mask, Base::outside, Base::several;
-    using Base::shift, Base::square_of, Base::sure, Base::sure_among, Base::sure_mask, Base::unsure, Base::wanted;
+    using Base::queries, Base::several, Base::shared, Base::shift, Base::square_of, Base::sure, Base::sure_among, Base::sure_mask,
+        Base::unsure, Base::wanted;
     static constexpr bool FLUSHED = !SCALED;  // where cutoffs are so small that they are scaled, so may be what decides
     alignas(64) real column[OTHERS + STEPS + 1][CANDIDATES + LANES];
     alignas(64) real near_points[PACKED ? 3 : 1][PACKED ? CANDIDATES + LANES : 1];
@@ -38,21 +40,30 @@ struct SumsBy : Way<SumsBy<Way>> {
     }
 
     void copied(int from, unsigned int near) {
-        const bool at_home = this->at_home();
+        const bool at_home = this->at_home(), turned = this->turned();
         for (int c = 0; c < OTHERS; ++c)
-            if (!at_home || COLUMN_AXES[c] < 0)
-                pack(lanes_from(columns + (long long)c * n + from), column[c] + filled, near);
-        if (STEPS > 0 && !at_home) {
-            const vec turns = lanes_from(columns + (long long)OTHERS * n + from);
-            for (int c = 0; c < STEPS; ++c) {
-                const ints turn = Lattice::turns_of<ints>(turns, STEP_AXES[c]);
-                pack(__builtin_convertvector(shift[STEP_AXES[c]] - turn, vec), column[OTHERS + c] + filled, near);
-            }
+            if (COLUMN_AXES[c] < 0)
+                pack(lanes_from(columns + (long long)COLUMN_NUMBERS[c] * n + from), column[c] + filled, near);
+            else if (!at_home)
+                pack(lanes_from(given(COLUMN_AXES[c]) + from), column[c] + filled, near);
+        for (int c = 0; c < STEPS && !at_home; ++c) {
+            ints steps = ints{} + shift[STEP_AXES[c]];
+            if (turned)
+                steps -= Lattice::turns_of<ints>(vec(lanes_from(given(DIM) + from)), STEP_AXES[c]);
+            pack(__builtin_convertvector(steps, vec), column[OTHERS + c] + filled, near);
         }
     }
+    // Must turns be looked at, and positions as they were given?
+    bool turned() const { return PERIODIC && READS_ROWS > 0 && shared.turned >= READS_ROWS; }
+    // Are there no images among the candidates? Then no pair has a shift.
+    bool at_home() const { return PERIODIC && !several && !turned(); }
+    // Where the numbers k of the rows of the sources stand, in the order of cells.
+    const real* given(int k) const { return turned() ? columns + (long long)(COLUMNS + k) * n : axis[k]; }
     void expect(int id) const {  // rows of queries stand anywhere
         if constexpr (OWN > 0)
             __builtin_prefetch(own_values + (long long)id * OWN);
+        if (turned())
+            __builtin_prefetch(queries + (long long)id * ROW);
     }
     void none(int id) { results.clear(id); }
     void chunk_done(int chunk) { results.store_totals(chunk); }
@@ -79,7 +90,8 @@ struct SumsBy : Way<SumsBy<Way>> {
     // AT_HOME: coordinates that the term reads are those of the candidates, and all steps are 0.
     template <bool AT_HOME>
     void meet_by(const real* q, int id, bool fresh, bool finished) {
-        const Term::Own own_part = term.own<AT_HOME>(own_values + (long long)id * OWN, q);
+        const Term::Own own_part =
+            term.own<AT_HOME>(own_values + (long long)id * OWN, q, turned() ? queries + (long long)id * ROW : nullptr);
         Reduction reduction(n);
         if constexpr (PACKED)
             meet_packed<AT_HOME>(q, id, own_part, reduction);
@@ -119,7 +131,7 @@ struct SumsBy : Way<SumsBy<Way>> {
                 continue;
             number summand[SUMMANDS];
             auto load = [&](int c) { return *(const number*)(column[c] + b); };
-            term.evaluate(own_part, points.p, columns_of<AT_HOME>(points, load), summand);
+            term.evaluate<AT_HOME>(own_part, points.p, columns_of<AT_HOME>(points, load), summand);
             reduction.add(summand, flags_of(hit), [&](Math::i32& source, Math::i32& code) {
                 for (int l = 0; l < LANES; ++l)
                     name(b + l, l, source, code);
@@ -131,7 +143,7 @@ struct SumsBy : Way<SumsBy<Way>> {
             const unsigned int hit = decided_between(q, id, points, doubtful + b, lanes_before(doubts - b));
             number summand[SUMMANDS];
             auto load = [&](int c) { return gathered(column[c], doubtful + b); };
-            term.evaluate(own_part, points.p, columns_of<AT_HOME>(points, load), summand);
+            term.evaluate<AT_HOME>(own_part, points.p, columns_of<AT_HOME>(points, load), summand);
             reduction.add(summand, flags_of(hit), [&](Math::i32& source, Math::i32& code) {
                 for (int l = 0; l < LANES; ++l)
                     name(doubtful[b + l], l, source, code);
@@ -172,7 +184,7 @@ struct SumsBy : Way<SumsBy<Way>> {
                 hit |= decided_between(q, id, points, doubtful + b, open);
             number summand[SUMMANDS];
             auto load = [&](int c) { return *(const number*)(near_column[c] + b); };
-            term.evaluate(own_part, points.p, columns_of<AT_HOME>(points, load), summand);
+            term.evaluate<AT_HOME>(own_part, points.p, columns_of<AT_HOME>(points, load), summand);
             reduction.add(summand, flags_of(hit), [&](Math::i32& source, Math::i32& code) {
                 for (int l = 0; l < LANES; ++l)
                     name(doubtful[b + l], l, source, code);

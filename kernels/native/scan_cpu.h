@@ -81,8 +81,6 @@ struct Scan : SearchArguments, SystemCells, SourcePlaces {
         outside = between > 0 ? between : band.outside;
     }
 
-    // Are all candidates, and all queries, where they were given, and none of them an image? Then no pair has a shift.
-    bool at_home() const { return PERIODIC && !several && !shared.turned; }
     // Finds the bands of so many candidates.
     void find_bands(int count) {
         for (int b = 0; BANDED && b < count; b += LANES) {

@@ -127,6 +127,19 @@ def test_images_of_a_kept_list_are_those_of_the_moved_particles(dtype, kind, ask
         np.testing.assert_allclose(sums, by_numpy.add_up(terms, pairs.i, len(after)), rtol=3e-5, atol=3e-5)
 
 
+def test_short_motion_is_no_wrapping_in_a_box_that_is_far_from_reduced():
+    """Fractional coordinates of a short motion are long there: rounded, they are no lattice vector that anybody moved by."""
+    rows, cutoff, skin = np.array([[0.3, 0.0, 0.0], [3.0, 0.3, 0.0], [0.1, 0.2, 0.3]]), 0.2, 0.05
+    box, rng = jfrnn.Box(rows), np.random.default_rng(0)
+    before = (rng.uniform(0, 1, (24, 3)) @ rows).astype(np.float32)
+    nbrs = jfrnn.search(before, cutoff, skin=skin, box=box, capacity=256)
+    step = rng.normal(size=before.shape)
+    step *= 0.4 * skin / np.linalg.norm(step, axis=1, keepdims=True)
+    for whole in (0, rng.integers(-2, 3, before.shape) @ rows):
+        after = (before + step + whole).astype(np.float32)
+        assert masked_images(nbrs, after) == oracle(after, cutoff, box)
+
+
 def test_a_box_that_changes_while_particles_are_wrapped():
     dtype, skin, cutoff, rng = np.float64, 0.1, 0.8, np.random.default_rng(2)
     x = rng.uniform(0, 1, (20, 3)) + rng.integers(-2, 3, (20, 3))

@@ -102,12 +102,16 @@ def marks_at_work(r, i, j):
 
 @pytest.mark.parametrize("fn", [marks, pytest.param(marks_at_work, marks=SLOW)])
 def test_where_no_pair_crosses_the_box(fn):
-    """Within a box pairs have no shift, and coordinates are those of the candidates; but not where a particle lies outside."""
+    """Within a box pairs have no shift, and coordinates are those of the candidates; but not where particles lie outside.
+
+    In the boxes beside it is a shift of the image alone, between wrapped positions; farther away turns are read.
+    """
     lengths, ids = np.array([8.0, 9.0]), np.arange(600, dtype=np.float32)
     x = (np.random.default_rng(0).random((600, 2)) * lengths).astype(np.float32)
     outside = x + np.where(ids[:, None] == 7, 2 * lengths, 0).astype(np.float32)
+    beside = x + ((ids[:, None] % 3 - 1) * lengths).astype(np.float32)
     sums = jax.jit(lambda x: fused(fn, x, 0.5, ids, box=jfrnn.Box(lengths)))
-    for at in (x, outside):
+    for at in (x, outside, beside):
         pairs = reference.reference_images(at, 0.5, matrix=np.diag(lengths), periodic=(True, True))
         assert_marks(sums(at), pairs, at, at, lengths)
 
