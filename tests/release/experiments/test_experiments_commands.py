@@ -18,7 +18,7 @@ ROOT = Path(_commands.__file__).resolve().parent.parent
 CONFIGS = ROOT / "experiments" / "configs"
 TOP = ("run", "report", "tables", "merge", "list", "show", "export", "gpu", "bench", "sph")
 BENCH = (
-    *("crossover", "crystals", "distributed", "domain", "house", "arrays", "latency", "lj", "options", "peers", "skin", "start"),
+    *("crossover", "crystals", "distributed", "domain", "arrays", "latency", "lj", "options", "peers", "skin", "start"),
     *("structures", "sums", "ties", "triangles", "use"),
 )
 SPH = ("validate", "speed", "gradients")
@@ -184,7 +184,6 @@ def test_steps_are_timed_of_scenes_that_have_an_nx(tmp_path):
         ("sph", "gradients", "memory"),
         *(("bench", name) for name in ("options", "ties", "crossover", "triangles", "skin", "use", "domain", "latency", "start")),
         ("bench", "peers", "scipy"),
-        ("bench", "house", "HEAD"),
     ],
     ids=lambda arguments: " ".join(map(str, arguments[:2])),
 )
@@ -223,9 +222,8 @@ def test_too_little_memory_is_said_in_a_line(capsys):
 
 
 def test_a_mistake_ends_a_process_with_2_and_a_line():
-    done = subprocess.run(
-        [sys.executable, "-m", "experiments", "bench", "skin", "--steps", "0"], cwd=ROOT, capture_output=True, text=True
-    )
+    command = [sys.executable, "-m", "experiments", "show", "corners", "--dim", "4"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr.startswith("error: --steps 0: ")
-    assert done.stderr.endswith("(see python -m experiments bench skin --help)\n")
+    assert done.stderr.startswith("error: --dim 4: ")
+    assert done.stderr.endswith("(see python -m experiments show --help)\n")
