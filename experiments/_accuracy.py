@@ -43,7 +43,7 @@ def errors(found: Found, row: dict[str, Any], exact: np.ndarray, positions: np.n
 def difference(found: Found, exact: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the entries (i, j) that are too many, with weight 1, and those that are missing, with weight -1.
 
-    Of a directed list they are directed; else each unordered pair stands once.
+    Entries of a directed list are directed; of other lists, each unordered pair stands once.
     """
     assert found.pairs is not None
     i, j = (np.asarray(part, np.int64) for part in found.pairs)

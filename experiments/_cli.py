@@ -34,7 +34,6 @@ class Bench(_commands.Commands):
             "crossover": "Time the backends over sizes.",
             "crystals": "Time batches of crystals in cells of their own.",
             "distributed": "Time lists, sums and fluids on 1 to k devices.",
-            "domain": "Time what empty space costs.",
             "arrays": "Time the array engine beside jax-md.",
             "latency": "Time calls for few particles.",
             "lj": "Time a Lennard-Jones liquid, beside jax-md's.",
@@ -46,7 +45,6 @@ class Bench(_commands.Commands):
             "sums_report": "Measure one sum over neighbors in many ways.",
             "ties": "Time lattices full of exact ties.",
             "triangles": "Time the triangles that are near particles.",
-            "use": "Time what uses a list: sorted particles, compressed rows.",
         }.items()
     }
 

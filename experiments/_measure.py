@@ -142,8 +142,8 @@ def compile_scan(
 ) -> Callable[[], Any]:
     """Return a compiled scan whose steps move x and call a function of it, or only move x; it keeps what the last step makes.
 
-    Nothing of a step can be left out, as all that it makes is carried along, and no step knows that nobody moves. `made` is what
-    the function makes of x, if that is known: then it is compiled in the scan alone.
+    The compiler cannot leave out a step, because the scan carries all that the step makes, and the velocity, which is 0, is an
+    argument. `made` is what the function makes of x, if that is known: then it is compiled in the scan alone.
     """
     import jax
     import jax.numpy as jnp

@@ -26,7 +26,7 @@ NOTES = """\
 - **s**: median time of a search, from raw positions to the finished result, without compilation; of several processes the median of
   their medians.
 - **±**: half the interval that holds the median with a probability of 95 %, in per cent of it; five processes can tell 93.75 % at
-  most, four 87.5 %, three 75 %. Of several processes it is that of their medians; of one, in brackets, that of its repeats alone.
+  most, four 87.5 %, three 75 %. It belongs to the medians of several processes, or, in brackets, to the repeats of one.
   table.csv tells how many there are of each.
 - **MB**: peak resident memory of the process during its first search, over what was resident after compilation; 10^6 bytes. On a
   GPU the peak of its memory over what it held at first: positions, list and scratch, or what the compiler tried out, if that is
@@ -34,9 +34,9 @@ NOTES = """\
 - **/ cll**, or another method's name in a sweep that has no `cll`: divided by the row of that method on the same scene, process by
   process of the same round on the same kind of machine. `≈`: within noise: the interval of that ratio holds 1 (of one process: the
   intervals of both overlap). `?`: fewer than three such rounds, or repeats too few to tell.
-- **missing**, **extra**: unordered pairs against the exact answer on the given floats, distance < cutoff. Of a method without pair
-  list (`~`), only the surplus and the deficit of each particle can be seen; of more than two million particles (`~`, too), those
-  of 20 000 of them.
+- **missing**, **extra**: unordered pairs against the exact answer on the given floats, distance < cutoff. A method without a pair
+  list (`~`) shows only the surplus and the deficit of each particle. Among more than two million particles (`~`, too), 20 000 are
+  compared.
 - **density error**, **gradient error**: of a poly6 density over the neighbors that were found and of its gradient, the largest of
   all particles, over the mean density, and over that per cutoff; `pair-sum` makes such a density itself.
 - **thesis**: Table 6.1 of J. Peifle, Implementation of a Nearest-Neighbor Search for Particle Simulation in Sparse Computational
@@ -51,7 +51,7 @@ NOTES = """\
 
 
 def report(folder: Path) -> None:
-    """Print the table of a sweep and the paths of its files: report.md, report.html, table.csv and the pictures, beside the rows.
+    """Print the table of a sweep and the paths of its files: report.md, table.csv and the pictures, beside the rows.
 
     Raises:
         UsageError: The folder holds no rows.
@@ -59,20 +59,19 @@ def report(folder: Path) -> None:
     rows = read_latest(folder)
     if not rows:
         raise UsageError(f"{folder}: no rows; fill it with `python -m experiments run CONFIG.toml --out {folder}`")
-    from experiments import _page, _plots, _statistics
+    from experiments import _plots, _statistics
 
     lines = _table.lines(rows)
     pictures = _plots.draw_all(_statistics.summarize(rows), folder, describe_origin(rows))
     write_csv(lines, folder / "table.csv")
     (folder / "report.md").write_text(markdown(rows, lines, pictures), encoding="utf-8")
-    _page.write(folder / "report.html", _title(rows), describe_origin(rows), lines, NOTES, pictures)
     console = Console(highlight=False, markup=False)
     if not console.is_terminal:
         console.width = 80
     console.print(rich_table(lines))
     for text in (*remarks(lines), describe_origin(rows)):
         console.print(text, soft_wrap=True)
-    for path in (folder / "report.md", folder / "report.html", folder / "table.csv", *pictures):
+    for path in (folder / "report.md", folder / "table.csv", *pictures):
         console.print(str(path), soft_wrap=True)
 
 
@@ -172,7 +171,7 @@ def _ratio(value: float | None) -> str:
 def rich_table(lines: list[dict[str, Any]]) -> Table:
     """Return the printed table, scene by scene: what has figures, or says why it has none, but for what is not installed.
 
-    It fits a terminal of 80 columns, where long names of scenes are broken; `report.md` and `report.html` have all columns.
+    It fits a terminal of 80 columns, where long names of scenes are broken; `report.md` has more columns, and `table.csv` all.
     """
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
     table.add_column("")

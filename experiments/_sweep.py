@@ -155,7 +155,7 @@ def _explain_exit(code: int, stderr: str) -> str:
 def merge(folder: Path, parts: Iterable[Path]) -> int:
     """Add to a folder the rows of others that it does not hold, and return how many came.
 
-    Of one key, a row that is ok counts, and among those the one with more repeats.
+    Among rows of one key, a row that is ok counts, and among those the one with more repeats.
 
     Raises:
         UsageError: There are no parts, a part has no rows, or a line of it is no row.

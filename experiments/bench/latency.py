@@ -89,7 +89,7 @@ def command(
     """Time calls and steps of a scan for few particles: `x + 1`, jfrnn, and jax-md and nvalchemi where they are installed.
 
     Points are random in the unit cube, float32, with about 30 neighbors. A call is waited for [µs]. A step of a compiled scan moves
-    the particles and does the same, "x + 1" nothing else. Ratios are to "x + 1". Of ways whose answers are wrong, no time is taken.
+    the particles and does the same, "x + 1" nothing else. Ratios are to "x + 1". Ways whose answers are wrong are not timed.
     """
     platform = jax.default_backend()
     asked = sizes or [n for n in SIZES if platform != "cpu" or n <= MOST_ON_CPU]

@@ -104,7 +104,7 @@ def _steps_of(n: int, asked: int | None) -> int:
 def _rows(n: int, steps: int, repeats: int) -> Iterator[table.Line]:
     """Yield a row for each way; all begin with the liquid that the crystal has become."""
     start, around = make_crystal(n), _measure.Bystanders()
-    melted = _run(WAYS["pair_sum, list"], start, SKINS[2], steps, 1)
+    melted = _run(WAYS["pair_sum, list"], start, SKINS[len(SKINS) // 2], steps, 1)
     liquid = start._replace(x=melted.x, v=melted.v)
     tried = {
         skin: _run(WAYS["pair_sum, list"], liquid, skin, steps, 1).seconds for skin in SKINS if CUTOFF + skin < start.length / 2

@@ -249,8 +249,9 @@ def _answers(name: str, cases: list[str], limit_s: float) -> Iterator[dict[str, 
         here.recv()  # it has been imported
         return here, worker
 
-    pipe, worker = start()
+    held = None
     for case in cases:
+        pipe, worker = held = held or start()
         pipe.send(case)
         answered = pipe.poll(limit_s)
         try:
@@ -261,9 +262,10 @@ def _answers(name: str, cases: list[str], limit_s: float) -> Iterator[dict[str, 
         if not answered:
             worker.kill()
             worker.join()
-            pipe, worker = start()
+            held = None
         yield answer
-    worker.kill()
+    if held is not None:
+        held[1].kill()
 
 
 def _serve(name: str, pipe: Connection) -> None:

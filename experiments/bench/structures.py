@@ -98,7 +98,7 @@ def command(
 ) -> str:
     """Time many structures of 2 to 200 atoms, first call included, and warm calls for one of 32 atoms.
 
-    Cutoff 5 angstrom, 0.06 atoms/angstrom³. Of jfrnn, the folder of compiled kernels is empty ("cold"), or it holds the kernel.
+    Cutoff 5 angstrom, 0.06 atoms/angstrom³. jfrnn finds an empty folder of compiled kernels ("cold"), or one that holds the kernel.
     """
     parts = [("warm calls", partial(_warm, repeats)), *((who, partial(_many, who, count)) for who in LIBRARIES)]
     return table.text(table.measure(out, "cpu", parts, [count, repeats], COLUMNS))

@@ -16,7 +16,7 @@ from experiments._rows import RowFile, TimedRow
 from experiments.bench.ways import WAYS, Spec, check_way
 
 ERROR_UNIT = "eps·√neighbors"
-"""Of errors of sums: what rounding makes of a sum of so many terms, in machine epsilons."""
+"""The unit of errors of sums: what rounding makes of a sum of so many terms, in machine epsilons."""
 
 
 class Config(Repeats):

@@ -1,9 +1,10 @@
-"""What the rows of a GPU run say: a table of calls, a table of what the choices cost, and a picture against the floor.
+"""What the rows of a GPU run say: a table for each kind of rows, and a picture against the floor.
 
 The floor of a search is the bytes that it cannot avoid, positions read once and list and counts written once, over the bandwidth
 that a copy reached in the same run.
 """
 
+import itertools
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,22 @@ from experiments._rows import RowFile
 from experiments._table import count, markdown
 
 OURS = "jfrnn warp"
-_TRIANGLE_KERNELS = ("prepare_s", "place_s", "fill_s", "allocate_s", "scatter_s", "query_s", "settle_s")
+_TITLES = {
+    "exactness": "Hard cases against the oracle",
+    "call": "Calls that are not waited for one by one",
+    "scan": "Steps of compiled scans",
+    "sum": "Sums over neighbors",
+    "study": "What the choices cost, kernels alone",
+    "memory": "Memory, planned and measured",
+    "triangles": "Triangles around a gear",
+}
+_UNSHOWN = {"key", "kind", "device", "versions", "machine", "commit", "dirty", "time", "seconds", "p10_s", "p90_s", "wrong_cases"}
+_SCENE = ("layout", "points")
+_FIRST = {  # the kind of the row that a row is divided by, in what both are alike, and its method; None: the first
+    **dict.fromkeys(("call", "scan"), ("call", _SCENE, OURS)),
+    "sum": ("sum", (*_SCENE, "gradient"), "pair_sum warp"),
+    "study": ("study", ("layout",), None),
+}
 
 
 def report(folder: Path) -> str:
@@ -23,7 +39,7 @@ def report(folder: Path) -> str:
         raise UsageError(f"{path} does not exist: run python -m experiments gpu CONFIG --out {folder} first")
     try:
         rows = RowFile(folder, dict).read()
-        parts = [part(rows) for part in (_head, _exactness, _calls, _sums, _study, _memory, _triangles)]
+        parts = [_head(rows), *(_section(rows, kind) for kind in _TITLES)]
     except (ValueError, KeyError, TypeError, StopIteration) as error:
         raise UsageError(f"{path}: holds no rows of a GPU run ({type(error).__name__}: {error}); name the folder of one") from error
     text = "\n\n".join(part for part in parts if part) + "\n"
@@ -54,77 +70,38 @@ def _head(rows: list[dict[str, Any]]) -> str:
     return f"{row['device']} · {versions} · commit {commit} · {row['time'][:10]} · copy {copy}"
 
 
-def _exactness(rows: list[dict[str, Any]]) -> str:
-    table = [
-        {"method": r["method"], "dtype": r["dtype"], "dim": r["dim"], "hard cases": r["cases"], "wrong": r["wrong"]}
-        for r in _of(rows, "exactness")
-    ]
-    return "## Hard cases against the oracle\n\n" + markdown(table)
+def _section(rows: list[dict[str, Any]], kind: str) -> str:
+    """Return a table of the rows of a kind, with a column for whatever one of them says; nothing where there are none."""
+    lines = [_beside(row, rows) for row in _of(rows, kind)]
+    names = [name for name in dict.fromkeys(itertools.chain(*lines)) if name not in _UNSHOWN]
+    table = [{_head_of(name): _cell(name, line.get(name)) for name in names} for line in lines]
+    return f"## {_TITLES[kind]}\n\n{markdown(table)}" if table else ""
 
 
-def _calls(rows: list[dict[str, Any]]) -> str:
-    copy, table = bandwidth(rows), []
-    ours = {(r["layout"], r["points"]): r["median_s"] for r in _of(rows, "call") if r["method"] == OURS}
-    for r in [*_of(rows, "call"), *_of(rows, "scan")]:
-        seconds, reference = r.get("median_s"), ours.get((r["layout"], r["points"]))
-        exact = r.get("exact_directed_pairs")
-        table.append({
-            "scene": r["layout"], "points": count(r["points"]),
-            "method": r["method"] + (", per step of a scan" if r["kind"] == "scan" else ""),
-            "ms": "·" if seconds is None else f"{1e3 * seconds:.4g}",
-            "/ ours": "·" if seconds is None or reference is None else f"{seconds / reference:.3g}",
-            "/ floor": "·" if seconds is None else f"{seconds / floor_seconds(r, copy):.3g}",
-            "pairs - exact": "·" if exact is None or r.get("directed_pairs") is None else r["directed_pairs"] - exact,
-            "reason": r.get("reason", "")[:80],
-        })  # fmt: skip
-    return "## Calls that are not waited for one by one\n\n" + markdown(table)
+def _beside(row: dict[str, Any], rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """Return a row with its time over that of our list, and over the floor; of a sum, over that of ours; of a study, the first."""
+    first = _FIRST.get(row["kind"])
+    if first is None or row.get("median_s") is None:
+        return row
+    kind, same, method = first
+    others = [r for r in _of(rows, kind) if r.get("median_s") and all(r.get(name) == row.get(name) for name in same)]
+    ours = next((r["median_s"] for r in others if method in (None, r["method"])), None)
+    beside = {} if ours is None else {"/ ours": row["median_s"] / ours}
+    if kind == "call":
+        beside["/ floor"] = row["median_s"] / floor_seconds(row, bandwidth(rows))
+    return row | beside
 
 
-def _sums(rows: list[dict[str, Any]]) -> str:
-    table, sums = [], _of(rows, "sum")
-    without_list = {(r["points"], r["gradient"]): r.get("median_s") for r in sums if r["method"] == "pair_sum warp"}
-    for r in sums:
-        seconds, ours = r.get("median_s"), without_list.get((r["points"], r["gradient"]))
-        table.append({
-            "scene": r["layout"], "points": count(r["points"]), "way": r["method"],
-            "what": "density, gradient" if r["gradient"] else "density",
-            "ms": "·" if seconds is None else f"{1e3 * seconds:.4g}",
-            "/ pair_sum warp": "·" if seconds is None or ours is None else f"{seconds / ours:.3g}",
-            "error / eps √k": f"{r['error']:.2g}" if "error" in r else "·",
-            "B per particle": f"{r['compiled_bytes'] / r['points']:.1f}" if "compiled_bytes" in r else "·",
-            "reason": r.get("reason", "")[:80],
-        })  # fmt: skip
-    return "## Sums over neighbors\n\n" + markdown(table)
+def _head_of(name: str) -> str:
+    return f"{name.removesuffix('_s').removesuffix('median') or 'time'} [ms]" if name.endswith("_s") else name.replace("_", " ")
 
 
-def _study(rows: list[dict[str, Any]]) -> str:
-    table = []
-    for r in _of(rows, "study"):
-        first = next(s for s in _of(rows, "study") if s["layout"] == r["layout"])
-        table.append({
-            "layout": r["layout"], "points": r["points"], "kernels": r["method"], "ms": f"{1e3 * r['median_s']:.4g}",
-            "/ first": f"{r['median_s'] / first['median_s']:.3g}", "query ms": f"{1e3 * r['query_s']:.4g}",
-            "pairs - exact": r["directed_pairs"] - r["exact_directed_pairs"],
-        })  # fmt: skip
-    return "## What the choices cost, kernels alone\n\n" + (markdown(table) if table else "No CUDA device: not measured.")
-
-
-def _memory(rows: list[dict[str, Any]]) -> str:
-    names = ("layout", "points", "capacity", "planned_bytes", "compiled_bytes", "peak_bytes", "warp_pool_bytes")
-    return "## Memory, planned and measured\n\n" + markdown([{name: r[name] for name in names} for r in _of(rows, "memory")])
-
-
-def _triangles(rows: list[dict[str, Any]]) -> str:
-    table = []
-    for r in _of(rows, "triangles"):
-        wrong = r.get("wrong", r.get("differing", ""))
-        stages = ", ".join(f"{name.removesuffix('_s')} {1e3 * r[name]:.3g}" for name in _TRIANGLE_KERNELS if name in r)
-        table.append({
-            "points": count(r["points"]), "dtype": r["dtype"], "cutoff": r["cutoff"], "slots": r["capacity"],
-            "pairs": r["pairs"], "method": r["method"], "ms": f"{1e3 * r['median_s']:.4g}", "wrong rows": wrong,
-            "kernels, ms": stages, "settled": r.get("settled", ""),
-        })  # fmt: skip
-    return "## Triangles around a gear\n\n" + markdown(table) if table else ""
+def _cell(name: str, value: Any) -> str:  # noqa: ANN401
+    if value is None:
+        return "·"
+    if isinstance(value, float):
+        return f"{1e3 * value if name.endswith('_s') else value:.4g}"
+    return count(value) if isinstance(value, int) and not isinstance(value, bool) else str(value)[:80]
 
 
 def _draw(rows: list[dict[str, Any]], path: Path) -> None:

@@ -59,8 +59,8 @@ def rows(
     """Time lists of n random particles around a gear, by "warp", "bvh" and "jax".
 
     "update" keeps the cells or the tree of a wall that stays, also for particles along a Morton curve, "rebuild" sorts it anew,
-    "count" makes no list; each is a call that is not waited for, or a step of a scan. Of the first two on CUDA, each kernel is
-    timed, too.
+    "count" makes no list; each is a call that is not waited for, or a step of a scan. On CUDA, each kernel of
+    "warp" and "bvh" is timed, too.
 
     Args:
         n: Particles.

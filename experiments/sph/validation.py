@@ -22,7 +22,7 @@ Curves = dict[str, list[list[float]]]
 class Seen(NamedTuple):
     """The fluid at a moment: time [s], positions, velocities, pressures, kinetic and potential energy [J]; no walls.
 
-    Of a gas also densities, its thermal energy [J], and its largest smoothing length over the smallest.
+    A gas has also densities, its thermal energy [J], and its largest smoothing length over the smallest.
     """
 
     time: float

@@ -18,8 +18,8 @@ ROOT = Path(_commands.__file__).resolve().parent.parent
 CONFIGS = ROOT / "experiments" / "configs"
 TOP = ("run", "report", "tables", "merge", "list", "show", "export", "gpu", "bench", "sph")
 BENCH = (
-    *("crossover", "crystals", "distributed", "domain", "house", "arrays", "latency", "lj", "options", "peers", "skin", "start"),
-    *("structures", "sums", "ties", "triangles", "use"),
+    *("crossover", "crystals", "distributed", "arrays", "latency", "lj", "options", "peers", "skin", "start"),
+    *("structures", "sums", "ties", "triangles"),
 )
 SPH = ("validate", "speed", "gradients")
 COMMANDS = (*TOP[:8], *(f"bench {name}" for name in BENCH), *(f"sph {name}" for name in SPH))
@@ -57,7 +57,7 @@ def test_the_list_of_commands_fits_a_screen(group, names):
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_help_keeps_what_stands_in_brackets(command):
-    units = {"show": ["[m]"], "export": ["[m]"], "run": ["[s]"], "bench skin": ["[m]"], "bench domain": ["[cutoffs]"]}
+    units = {"show": ["[m]"], "export": ["[m]"], "run": ["[s]"], "bench skin": ["[m]"]}
     units |= {"bench triangles": ["[modules]"], "bench peers": ["[s]", "--group peers"]}
     units |= {"bench latency": ["[µs]"], "bench start": ["[s]"], "bench structures": ["angstrom"]}
     text = told(*command.split(), "--help")
@@ -81,12 +81,9 @@ def test_list_says_what_there_is():
         (("bench", "skin", "--repeats=1"), "--repeats 1: "),
         (("bench", "skin", "--spacing", "nan"), "--spacing nan: "),
         (("bench", "skin", "--spacing", "-1"), "--spacing -1: "),
-        (("bench", "domain", "nan"), "Invalid value for "),
-        (("bench", "domain", "0"), "Invalid value for "),
-        (("bench", "domain", "--points", "1"), "--points 1: "),
-        (("bench", "domain", "--points", "10000000000"), "--points 10000000000: "),
-        (("bench", "use", "--points", "abc"), "--points abc: "),
-        (("bench", "use", "--rounds", "1"), "--rounds 1: "),
+        (("bench", "triangles", "--points", "10000000000"), "--points 10000000000: "),
+        (("bench", "triangles", "--points", "abc"), "--points abc: "),
+        (("bench", "triangles", "--rounds", "1"), "--rounds 1: "),
         (("bench", "options", "--backend", "cuda"), "--backend cuda: allowed: auto, jax, warp, brute"),
         (("bench", "ties", "--backend", "cuda"), "--backend cuda: allowed: auto, jax, warp, brute"),
         (("bench", "ties", "--cube", "1"), "--cube 1: "),
@@ -182,9 +179,8 @@ def test_steps_are_timed_of_scenes_that_have_an_nx(tmp_path):
         ("sph", "speed", CONFIGS / "sph_speed.toml"),
         ("sph", "validate", "one"),
         ("sph", "gradients", "memory"),
-        *(("bench", name) for name in ("options", "ties", "crossover", "triangles", "skin", "use", "domain", "latency", "start")),
+        *(("bench", name) for name in ("options", "ties", "crossover", "triangles", "skin", "latency", "start")),
         ("bench", "peers", "scipy"),
-        ("bench", "house", "HEAD"),
     ],
     ids=lambda arguments: " ".join(map(str, arguments[:2])),
 )
@@ -223,9 +219,8 @@ def test_too_little_memory_is_said_in_a_line(capsys):
 
 
 def test_a_mistake_ends_a_process_with_2_and_a_line():
-    done = subprocess.run(
-        [sys.executable, "-m", "experiments", "bench", "skin", "--steps", "0"], cwd=ROOT, capture_output=True, text=True
-    )
+    command = [sys.executable, "-m", "experiments", "show", "corners", "--dim", "4"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr.startswith("error: --steps 0: ")
-    assert done.stderr.endswith("(see python -m experiments bench skin --help)\n")
+    assert done.stderr.startswith("error: --dim 4: ")
+    assert done.stderr.endswith("(see python -m experiments show --help)\n")

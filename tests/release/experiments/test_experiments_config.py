@@ -5,8 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from places import ROOT
+from typer.testing import CliRunner
 
 from experiments import _config, _layouts, _rows, _sweep, _thesis, _worker, methods
+from experiments._cli import app
 from experiments._errors import UsageError
 
 CONFIGS = ROOT / "experiments" / "configs"
@@ -108,9 +110,8 @@ def test_a_config_that_is_not_there(tmp_path):
 def test_the_command_ends_with_2_and_no_traceback(tmp_path):
     path = tmp_path / "sweep.toml"
     path.write_text(GOOD.replace("repeats = 5", "repeat = 5"))
-    command = [sys.executable, "-m", "experiments", "run", str(path), "--out", str(tmp_path / "out")]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60)
-    assert done.returncode == 2
+    done = CliRunner().invoke(app, ["run", str(path), "--out", str(tmp_path / "out")])
+    assert done.exit_code == 2
     assert done.stdout == ""
     assert done.stderr.startswith(f"error: {path}: repeat: unknown key (value 5); allowed: repeats, ")
     assert len(done.stderr.splitlines()) == 1
@@ -172,17 +173,13 @@ def test_smoke_config_has_every_method():
     assert set(_config.load(CONFIGS / "smoke.toml").methods) == set(methods.names())
 
 
-def test_help_imports_nothing_heavy():
-    heavy = {"jax", "scipy", "warp", "matplotlib", "pyvista", "pandas", "numpy", "pydantic"}
-    code = f"import sys; from experiments import _cli; print(sorted({heavy} & set(sys.modules)))"
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True, timeout=60)
-    assert done.stdout == "[]\n"
-
-
-def test_a_process_that_needs_no_jax_does_not_wait_for_it(tmp_path):
+def test_what_needs_nothing_heavy_imports_nothing_heavy(tmp_path):
+    """The help of commands, and then a worker that searches without JAX, in one process."""
     (spec,) = load(tmp_path, 'methods = ["scipy-kdtree"]\nspacing = 1e-3\nrepeats = 1\n[[scenes]]\nlayouts = ["corners"]\n').specs()
     task = _sweep._task("measure", spec, tmp_path)
-    code = f"import sys; from experiments import _worker; print(_worker._answer({task})['status'])\n"
+    heavy = {"jax", "scipy", "warp", "matplotlib", "pyvista", "pandas", "numpy", "pydantic"}
+    code = f"import sys; from experiments import _cli; print(sorted({heavy} & set(sys.modules)))\n"
+    code += f"from experiments import _worker; print(_worker._answer({task})['status'])\n"
     code += "print(sorted({'jax', 'jfrnn', 'pandas', 'matplotlib'} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True, timeout=60)
-    assert done.stdout.splitlines() == ["ok", "[]"]
+    assert done.stdout.splitlines() == ["[]", "ok", "[]"]

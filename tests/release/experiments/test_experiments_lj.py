@@ -38,7 +38,7 @@ def test_the_potential_goes_to_zero_smoothly():
 
 
 def test_rows(monkeypatch, tmp_path, foreign):
-    monkeypatch.setattr(lj, "SKINS", (0.2, 0.3, 0.4))
+    monkeypatch.setattr(lj, "SKINS", (0.2, 0.3))
     given = ["bench", "lj", "--sizes", "343", "--steps", "3", "--repeats", "1", "--out", str(tmp_path)]
     result = CliRunner().invoke(app, given)
     assert result.exit_code == 0, result.output

@@ -130,7 +130,7 @@ def test_scenes_stand_by_size_and_are_told_apart():
 def test_printed_table_and_paths(reported):
     folder, printed = reported
     lines = printed.splitlines()
-    assert lines[-11:-9] == [str(folder / "report.html"), str(folder / "table.csv")]
+    assert lines[-11:-9] == [str(folder / "report.md"), str(folder / "table.csv")]
     assert lines[-9:] == [str(folder / f"{name}.png") for name in PICTURES]
     assert ["s", "MB", "missing", "extra"] in [line.split() for line in lines]
     full = lines.index(next(line for line in lines if line.strip() == "full 100 %, 250 000 points"))
