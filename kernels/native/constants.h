@@ -24,8 +24,9 @@ constexpr int SUMS = 0;                // 1: summands are added up, 2: the large
 constexpr int EXCLUDING = 0;           // 1: queries exclude sources, 2: images of sources
 // Of a term that is summed: columns of numbers of j and of lattice steps, numbers of i, sums over all pairs and of each i.
 constexpr int OTHERS = 1, STEPS = 0, OWN = 0, TOTALS = 1, ROW_SUMS = 1;
-constexpr int FIRST_SUMS = 1;       // of those of each i, that stand in an array of their own
-constexpr bool COMPENSATED = true;  // sums are carried in twice the precision
+constexpr int COLUMNS = 1, READS_ROWS = 0;  // columns of numbers of j; how far particles must be turned for rows to be read
+constexpr int FIRST_SUMS = 1;               // of those of each i, that stand in an array of their own
+constexpr bool COMPENSATED = true;          // sums are carried in twice the precision
 constexpr bool PACKED = false;   // what is near comes together first, so that the term is evaluated for hardly more than the pairs
 constexpr bool SKIPPED = false;  // the term is not evaluated for vectors without a pair
 // Of CUDA: what a search allocates, and how it is launched (see jfrnn/kernels/cells_cuda.py).
