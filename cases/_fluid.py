@@ -238,7 +238,8 @@ def inflow(
         Positions and velocities, shape [layers · k, d], and when each enters [s], shape [layers · k]: for `Scene`.
     """
     speed = float(np.linalg.norm(velocity))
-    enters = np.arange(int(duration * speed / spacing), dtype=np.float64) * spacing / speed
+    layers = int(duration * speed / spacing * (1 + 1e-12))  # a whole number of them is not lost to rounding
+    enters = np.arange(layers, dtype=np.float64) * spacing / speed
     positions = np.tile(layer, (len(enters), 1))
     return positions, np.broadcast_to(np.asarray(velocity, float), positions.shape).copy(), np.repeat(enters, len(layer))
 

@@ -25,6 +25,7 @@ from jfrnn.sph.solver import (
     rollout,
     step,
 )
+from jfrnn.sph.toml_scenes import read_scene
 
 __all__ = [
     "DivergedError",
@@ -58,6 +59,7 @@ __all__ = [
     "make_scene",
     "make_state",
     "pressure_at",
+    "read_scene",
     "read_solid",
     "rollout",
     "run",

@@ -46,7 +46,7 @@ def check_scene(scene: Scene) -> None:
             raise SceneError(f"periodic.axes must say of each of {scene.dim} axes True or False, got {box.axes!r}.")
     if scene.solid is not None:
         _check_solid(scene.solid, scene.dim)
-    _check_physics(scene.physics, PHYSICS if isinstance(scene, FluidScene) else PHYSICS_OF_GASES)
+    check_physics(scene.physics)
     if isinstance(scene, FluidScene):
         _check_fluid(scene)
 
@@ -137,8 +137,13 @@ def _check_solid(solid: fluids.Solid, dim: int) -> None:
                 raise SceneError(f"solid.turning.{name} must have a number for each of {dim} axes, got {vector!r}.")
 
 
-def _check_physics(physics: Any, kinds: dict[str, Any]) -> None:  # noqa: ANN401
-    """Refuse what the command line would; numbers that are traced have no value to look at."""
+def check_physics(physics: Any) -> None:  # noqa: ANN401
+    """Refuse what the command line would; numbers that are traced have no value to look at.
+
+    Raises:
+        SceneError: Names the field.
+    """
+    kinds = PHYSICS if isinstance(physics, fluids.Physics) else PHYSICS_OF_GASES
     for field in fields(physics):
         value = getattr(physics, field.name)
         if isinstance(value, Tracer):

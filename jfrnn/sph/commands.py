@@ -8,7 +8,7 @@ from typing import Any, NoReturn
 
 import jax
 
-from jfrnn.sph import files, listing, ranges, runs, settings
+from jfrnn.sph import files, listing, ranges, runs, settings, toml_scenes
 from jfrnn.sph.errors import DivergedError, SceneError
 
 
@@ -50,7 +50,7 @@ def _make_parser() -> _Parser:
     what = "run a scene, or go on with it from its last snapshot: snapshots, energies, pictures"
     run = add("run", help=what, description=what, allow_abbrev=False)
     run.set_defaults(act=_run)
-    run.add_argument("scene", metavar="SCENE", help="such as dam, taylor-green, dam-break-2d, jet: see `list`")
+    run.add_argument("scene", metavar="SCENE", help="such as dam, taylor-green, jet: see `list`; or an own one, FILE.toml")
     told = "of the scene, or of its physics; `list SCENE` names them"
     run.add_argument("--set", dest="settings", action="append", default=[], metavar="KEY=VALUE", help=told)
     run.add_argument("--out", type=Path, help="folder of the run; out/sph/SCENE without it")
@@ -100,9 +100,14 @@ def _run(given: argparse.Namespace) -> str:
     if given.solid is None and given.solid_unit is not None:
         raise SceneError(f"--solid-unit {given.solid_unit:g}: is the unit of the file of --solid; name that file too")
     jax.config.update("jax_enable_x64", given.dtype == "float64")
-    scene = settings.make_scene(given.scene, given.settings)
+    if given.scene.endswith(".toml"):
+        if given.settings:
+            raise SceneError(f"--set {given.settings[0]}: {given.scene} says all of its scene; change it there")
+        scene = toml_scenes.read_scene(given.scene)
+    else:
+        scene = settings.make_scene(given.scene, given.settings)
     scene = scene if given.initial is None else files.with_particles(scene, given.initial)
     scene = scene if given.solid is None else files.with_solid(scene, given.solid, given.solid_unit or 1.0)
-    folder = given.out or Path("out") / "sph" / given.scene
+    folder = given.out or Path("out") / "sph" / scene.name
     runs.run(scene, folder, runs.How(given.frames, given.dtype, given.neighbors, given.skin, given.pictures))
     return str(folder)

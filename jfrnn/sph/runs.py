@@ -72,7 +72,8 @@ def run(
 
     Args:
         scene: The scene.
-        folder: Gets run.json, energies.csv, probes.csv, snapshots/STEP.npz and .vtp, frames/STEP.png, NAME.gif.
+        folder: Gets run.json, energies.csv, probes.csv, snapshots/STEP.npz and .vtp, NAME.pvd, the series of those for ParaView,
+            frames/STEP.png, NAME.gif.
         how: Options.
         force: As in `make_model`. It is no part of run.json: who goes on with a run gives the same.
         probes: Functions (model, state) -> numbers, arrays or dicts of them, inside jit, whose values are columns of probes.csv.
@@ -209,11 +210,11 @@ class _Writer:
     def line(self, s: State, step: int) -> dict[str, float]:
         """Add a line to each table, and return the energies."""
         self._line = snapshots.energies(self._model, s, self._scene)
-        snapshots.add_line(self._line, self._folder / "energies.csv", step)
+        snapshots.add_line(self._line, self._folder / "energies.csv", step, s.x.shape[1])
         if self._probe is not None:
             seen = self._probe(self._model, s).items()
             values = {key: number for name, value in seen for key, number in columns(name, value).items()}
-            snapshots.add_line({"time": self._line["time"]} | values, self._folder / "probes.csv", step)
+            snapshots.add_line({"time": self._line["time"]} | values, self._folder / "probes.csv", step, s.x.shape[1])
         return self._line
 
     def snapshot(self, s: State, nbrs: Neighbors, step: int) -> None:
@@ -228,3 +229,4 @@ class _Writer:
             there = snapshots.are_there(scene, s)
             frames.draw(scene, there, x, v, time, float(top), self._folder / "frames" / f"{step:09d}.png")
         snapshots.save(s, scene, np.asarray(rho), np.asarray(p), self._folder / "snapshots", step)
+        snapshots.add_to_series(self._folder / f"{scene.name}.pvd", float(s.time), step)

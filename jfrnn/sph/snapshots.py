@@ -3,6 +3,7 @@
 import errno
 import json
 import os
+import re
 from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile
@@ -11,10 +12,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from jfrnn.cases.fluids import Scene
-from jfrnn.sph import budget, solids, solver
+from jfrnn.sph import budget, origin, solids, solver
 from jfrnn.sph.errors import SceneError
 from jfrnn.sph.model import kind_of
 from jfrnn.sph.particles import Flow, State, Thermal
+
+UNITS = "SI: m, kg, s; in 2D of a slice 1 m thick"
+_OF_LINES = {
+    **dict.fromkeys(("kinetic", "potential", "thermal", "total"), ("J", "J/m")),
+    **{"time": ("s", "s"), "momentum": ("kg m/s", "kg/s"), "top_speed": ("m/s", "m/s"), "clearance": ("m", "m")},
+    "mass": ("kg", "kg/m"),
+}
 
 
 def are_there(scene: Scene, s: State) -> np.ndarray:
@@ -57,7 +65,8 @@ def check_same(about: dict[str, Any], folder: Path) -> None:
     Raises:
         SceneError: The folder holds a run of something else, or cannot be written.
     """
-    path, text = _take(folder) / "run.json", json.dumps(about, indent=1, sort_keys=True)
+    path = _take(folder) / "run.json"
+    text = json.dumps(about | {"units": UNITS, "made_by": origin.tell()}, indent=1, sort_keys=True)
     if not path.exists():
         path.write_text(text)
         return
@@ -65,7 +74,8 @@ def check_same(about: dict[str, Any], folder: Path) -> None:
         there = dict(json.loads(path.read_text()))
     except (TypeError, ValueError) as error:
         raise SceneError(f"{path}: says no run ({error}); take another folder, or remove it") from error
-    asked = json.loads(text)
+    asked = json.loads(json.dumps(about))
+    there = {key: value for key, value in there.items() if key not in ("units", "made_by")}
     if _goes_on(there, asked):
         path.write_text(text)
         return
@@ -120,13 +130,38 @@ def energies(model: Flow, state: State, scene: Scene) -> dict[str, float]:
     return line if distances is None else line | {"clearance": float(distances.min(initial=np.inf))}
 
 
-def add_line(line: dict[str, float], path: Path, step: int) -> None:
-    """Add a line to a CSV file; lines of this step and later, of a run that was stopped, are removed before."""
-    text = ["step," + ",".join(line)]
+def add_line(line: dict[str, float], path: Path, step: int, dim: int) -> None:
+    """Add a line to a CSV file; lines of this step and later, of a run that was stopped, are removed before.
+
+    Heads say units where they are known, those of a slice 1 m thick in 2D, such as "kinetic [J/m]".
+    """
+    text = ["step," + ",".join(_head(name, dim) for name in line)]
     if path.exists():
         text += [old for old in path.read_text().splitlines()[1:] if int(old.split(",")[0]) < step]
     part = path.with_suffix(".part")
     part.write_text("\n".join([*text, ",".join([str(step), *(f"{value:.12g}" for value in line.values())])]) + "\n")
+    part.replace(path)
+
+
+def _head(name: str, dim: int) -> str:
+    kind = name.partition("_")[0] if name.startswith(("momentum", "mass")) else name
+    if kind not in _OF_LINES:
+        return name
+    unit, per_meter = _OF_LINES[kind]
+    return f"{name} [{unit if dim == len('xyz') else per_meter}]" if unit else name
+
+
+def add_to_series(path: Path, time: float, step: int) -> None:
+    """Add STEP.vtp to a series that ParaView opens; those of this step and later are removed before."""
+    kept = []
+    if path.exists():
+        lines = re.findall(r'^<DataSet .*file="snapshots/(\d+)\.vtp"/>$', path.read_text(), re.MULTILINE)
+        whole = re.findall(r"^<DataSet .*$", path.read_text(), re.MULTILINE)
+        kept = [line for number, line in zip(lines, whole, strict=True) if int(number) < step]
+    kept.append(f'<DataSet timestep="{time:.12g}" file="snapshots/{step:09d}.vtp"/>')
+    part = path.with_suffix(".part")
+    text = "\n".join(['<VTKFile type="Collection" version="0.1">', "<Collection>", *kept, "</Collection>", "</VTKFile>", ""])
+    part.write_text(text)
     part.replace(path)
 
 

@@ -32,6 +32,7 @@ WHERE_NEEDED = {  # third-party modules that single files import where they are 
     "_engine/start.py": {"warp"},
     "sph/frames.py": {"matplotlib", "PIL"},
     "sph/ranges.py": {"pydantic"},
+    "sph/toml_scenes.py": {"pydantic", "trimesh"},
     "sph/files.py": {"trimesh"},
     "sph/snapshots.py": {"pyvista"},
 }

@@ -31,6 +31,13 @@ def refused(*arguments):
     return err.removeprefix("error: ").rstrip("\n")
 
 
+def read_table(path):
+    """Return the columns of a table by their heads without units."""
+    heads = path.read_text().partition("\n")[0].split(",")
+    columns = np.genfromtxt(path, delimiter=",", skip_header=1, ndmin=2).T
+    return {head.partition(" [")[0]: column for head, column in zip(heads, columns, strict=True)}
+
+
 def told(*arguments):
     code, out, err = invoke(*arguments)
     assert (code, err) == (0, "")

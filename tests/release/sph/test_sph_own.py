@@ -7,7 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.tree_util import Partial
+from places import ROOT
+from test_sph_commands import invoke, read_table
 
+import jfrnn
 from jfrnn import sph
 from jfrnn.sph.errors import SceneError
 from jfrnn.sph.particles import mass_there
@@ -44,7 +47,7 @@ def test_particles_that_leave_are_gone_and_counted(tmp_path):
     scene = replace(FREE, outflow=sph.Tank((-1.0, -1.0), (0.3, 30.0)), enters=np.array([0.0, 0.8, 0.0]))
     scene = replace(scene, positions=FEW * [0.5, 1.0], duration=1.0)
     end = sph.run(scene, tmp_path, sph.How(frames=10, pictures=False))
-    table = np.genfromtxt(tmp_path / "energies.csv", delimiter=",", names=True)
+    table = read_table(tmp_path / "energies.csv")
     np.testing.assert_array_equal(table["mass_in"], [5.0] * 8 + [7.0] * 3)
     np.testing.assert_array_equal(table["mass_out"], [0.0] * 4 + [1.0] * 5 + [3.0] * 2)  # 1 kg at 0.3 s, 2 kg at once
     np.testing.assert_array_equal(table["mass"], table["mass_in"] - table["mass_out"])
@@ -80,9 +83,83 @@ def test_a_run_goes_on_for_longer_and_writes_a_table(tmp_path):
     sph.run(replace(scene, duration=0.2), tmp_path / "b", longer, probes=probes)
     for name in ("energies.csv", "probes.csv"):
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
-    table = np.genfromtxt(tmp_path / "a" / "probes.csv", delimiter=",", names=True)
-    assert table.dtype.names == ("step", "time", "own_far_0", "own_far_1", "own_time")
+    table = read_table(tmp_path / "a" / "probes.csv")
+    assert tuple(table) == ("step", "time", "own_far_0", "own_far_1", "own_time")
     np.testing.assert_allclose(table["own_time"], [0, 0.05, 0.1, 0.15, 0.2])
     assert json.loads((tmp_path / "a" / "run.json").read_text())["duration"] == 0.2
     with pytest.raises(SceneError, match="holds a run with another duration, frames"):
         sph.run(replace(scene, duration=0.3), tmp_path / "a", short, probes=probes)
+
+
+BATH = """
+spacing = 0.1
+duration = 0.01
+step = 0.005
+
+[physics]
+density = 1000.0
+sound_speed = 10.0
+gravity = [0.0, -9.81]
+
+[[fill]]
+lower = [0.0, 0.0]
+upper = [0.4, 0.3]
+velocity = [0.5, 0.0]
+
+[[walls]]
+lower = [0.0, 0.0]
+upper = [0.8, 0.5]
+open = ["+y"]
+
+[[inflow]]
+lower = [0.0, 0.5]
+upper = [0.1, 0.6]
+velocity = [0.0, -1.0]
+duration = 0.3
+"""
+
+
+def test_a_scene_from_a_file(tmp_path):
+    (tmp_path / "bath.toml").write_text(BATH)
+    scene = sph.read_scene(tmp_path / "bath.toml")
+    dummies = (8 + 2 * 3) * (5 + 3) - 8 * 5  # three layers, none above
+    assert (scene.name, scene.n, scene.wall.sum()) == ("bath", 12 + 3 + dummies, dummies)
+    np.testing.assert_allclose(scene.enters[:15], [0.0] * 12 + [0.0, 0.1, 0.2], atol=1e-12)
+    np.testing.assert_array_equal(scene.velocities[[0, 12, -1]], [[0.5, 0.0], [0.0, -1.0], [0.0, 0.0]])
+    assert scene.positions[scene.wall].min() == pytest.approx(-0.25)
+    assert (scene.physics.smoothing, scene.physics.gravity) == (pytest.approx(0.15), (0.0, -9.81))
+    code, out, _ = invoke("run", tmp_path / "bath.toml", "--frames", 1, "--no-pictures", "--out", tmp_path / "out")
+    assert (code, out.strip()) == (0, str(tmp_path / "out"))
+    head = (tmp_path / "out" / "energies.csv").read_text().splitlines()[0]
+    assert head.startswith("step,time [s],kinetic [J/m],potential [J/m],momentum_x [kg/s],") and ",mass_in [kg/m]," in head
+    series = (tmp_path / "out" / "bath.pvd").read_text()
+    assert '<DataSet timestep="0.01" file="snapshots/000000002.vtp"/>' in series and series.count("<DataSet") == 2
+    assert json.loads((tmp_path / "out" / "run.json").read_text())["made_by"]["jfrnn"] == jfrnn.__version__
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("spacing = 0.1", "spacing = -0.1", "spacing: input should be greater than 0, got -0.1"),
+        ("spacing = 0.1", "spacing = ", "is no TOML"),
+        ("step = 0.005", "steps = 0.005", "steps: extra inputs are not permitted"),
+        ("sound_speed = 10.0", "sound = 10.0", "physics: got an unexpected keyword argument 'sound'"),
+        ("density = 1000.0", "density = -1.0", "physics.density: got -1.0; input should be greater than 0"),
+        ("density = 1000.0", 'kernel = "gauss"\ndensity = 1.0', "physics.kernel: got 'gauss'; input should be 'cubic', "),
+        ("upper = [0.4, 0.3]", "upper = [0.04, 0.3]", "fill: from .* there is no room for particles 0.1 m apart"),
+        ("velocity = [0.5, 0.0]", "velocity = [0.5]", "fill.velocity must have 2 numbers"),
+        ('open = ["+y"]', 'open = ["up"]', r"walls\[0\].open\[0\]: input should be '-x', "),
+        ("[0.0, -9.81]", "[0.0, 0.0, -9.81]", "gravity has 3 components, expected 2 in 2D"),
+        ("velocity = [0.0, -1.0]", "velocity = [0.0, 0.0]", "inflow.velocity must have 2 numbers that are not all 0"),
+    ],
+)
+def test_a_mistake_in_a_file_is_named(tmp_path, old, new, message):
+    (tmp_path / "bath.toml").write_text(BATH.replace(old, new))
+    with pytest.raises(SceneError, match=rf"bath\.toml: {message}"):
+        sph.read_scene(tmp_path / "bath.toml")
+
+
+def test_the_file_of_the_page_is_a_scene(tmp_path):
+    text = (ROOT / "docs" / "own-scene.md").read_text(encoding="utf-8")
+    (tmp_path / "page.toml").write_text(text.partition("```toml\n")[2].partition("```")[0])
+    assert sph.read_scene(tmp_path / "page.toml").outflow == sph.Tank((-np.inf, -np.inf), (1.0, np.inf))

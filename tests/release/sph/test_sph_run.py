@@ -11,6 +11,7 @@ import pytest
 import pyvista
 import trimesh
 from test_sph_commands import invoke as command
+from test_sph_commands import read_table
 
 from jfrnn._triangles.winding import is_closed
 from jfrnn.cases import fluids, meshes
@@ -39,7 +40,7 @@ def test_a_run_writes_snapshots_energies_frames_and_a_gif(tmp_path):
     for folder, ending in (("snapshots", "npz"), ("snapshots", "vtp"), ("frames", "png")):
         assert sorted(path.stem for path in (tmp_path / folder).glob(f"*.{ending}")) == names
     assert (tmp_path / "four.gif").read_bytes()[:4] == b"GIF8"
-    table = np.genfromtxt(tmp_path / "energies.csv", delimiter=",", names=True)
+    table = read_table(tmp_path / "energies.csv")
     np.testing.assert_allclose(table["time"], [0, 0.001, 0.002, 0.003], atol=1e-12)
     np.testing.assert_allclose(table["total"], table["kinetic"] + table["potential"], rtol=1e-9)
     cloud = pyvista.read(tmp_path / "snapshots" / "000000030.vtp")
@@ -56,7 +57,7 @@ def test_a_killed_run_goes_on_to_the_same_end(tmp_path, neighbors):
     for step in (20, 30):
         (killed / "snapshots" / f"{step:09d}.npz").unlink()
     invoke(*options, "--out", killed)
-    tables = [np.genfromtxt(folder / "energies.csv", delimiter=",", names=True)["kinetic"] for folder in (whole, killed)]
+    tables = [read_table(folder / "energies.csv")["kinetic"] for folder in (whole, killed)]
     tolerance = 0 if neighbors == "pair_sum" else 1e-9  # a list that is made anew may order its rows, and their sums, otherwise
     np.testing.assert_allclose(*tables, rtol=tolerance)
     np.testing.assert_allclose(load(whole, 30)["x"], load(killed, 30)["x"], rtol=tolerance)

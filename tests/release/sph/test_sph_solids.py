@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from matplotlib.path import Path as Outline
-from test_sph_commands import invoke
+from test_sph_commands import invoke, read_table
 
 from jfrnn.cases import fluids, meshes
 from jfrnn.sph import budget, health, solids, solver, view
@@ -275,7 +275,7 @@ def test_a_run_of_the_jet_onto_the_gear(tmp_path):
     options = ["jet-gear", "--set", "layers=3", "--set", "faces=400", "--set", "duration=0.0006", "--set", "height=0.001"]
     options += ["--frames", "2", "--dtype", "float32", "--out", str(tmp_path)]
     assert invoke("run", *options)[0] == 0
-    table = np.genfromtxt(tmp_path / "energies.csv", delimiter=",", names=True)
+    table = read_table(tmp_path / "energies.csv")
     assert len(list((tmp_path / "frames").glob("*.png"))) == 3
     assert table["clearance"].min() > 0
     last = sorted((tmp_path / "snapshots").glob("*.npz"))[-1]

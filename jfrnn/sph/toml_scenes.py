@@ -1,0 +1,218 @@
+"""A scene of one's own from a TOML file: blocks and meshes to fill, walls, what acts, inflow, outflow, a solid that may turn."""
+
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from jfrnn.cases.fluids import FluidScene, Periodic, Physics, Solid, Tank, Turning, inflow, lattice
+from jfrnn.sph.check import check_physics, check_scene
+from jfrnn.sph.errors import SceneError
+from jfrnn.sph.files import read_solid
+from jfrnn.sph.kernels import KERNELS
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Place = list[Annotated[float, Field(allow_inf_nan=False)]]
+
+
+class _Table(BaseModel):
+    model_config = ConfigDict(extra="forbid", strict=False)
+
+
+class Block(_Table):
+    """A box full of particles, from a lower to an upper corner [m]; or the inside of a mesh of the file, whose unit is in m."""
+
+    lower: Place | None = None
+    upper: Place | None = None
+    file: str | None = None
+    unit: Positive = 1.0
+    velocity: Place | None = None
+
+
+class Walls(_Table):
+    """A tank of dummy particles around a lower and an upper corner [m]; `open` names sides without, such as "+z"."""
+
+    lower: Place
+    upper: Place
+    open: list[Literal["-x", "+x", "-y", "+y", "-z", "+z"]] = []
+
+
+class Inflow(_Table):
+    """A block, one spacing thick along the velocity, whose particles enter layer by layer for a time [s]."""
+
+    lower: Place
+    upper: Place
+    velocity: Place
+    duration: Positive
+
+
+class SolidFile(_Table):
+    """A closed wall of triangles: a file, its unit [m], and how it turns."""
+
+    file: str
+    unit: Positive = 1.0
+    center: Place | None = None
+    axis: Place | None = None
+    rate: float | None = None
+
+
+class Corners(_Table):
+    """A lower and an upper corner [m], or infinite."""
+
+    lower: list[float]
+    upper: list[float]
+
+
+class Box(_Table):
+    """A box that repeats itself along axes such as "xy"."""
+
+    lower: Place
+    upper: Place
+    axes: str
+
+
+class Own(_Table):
+    """The whole file."""
+
+    spacing: Positive
+    duration: Positive
+    step: Positive | None = None
+    fill: list[Block] = []
+    walls: list[Walls] = []
+    inflow: list[Inflow] = []
+    outflow: Corners | None = None
+    periodic: Box | None = None
+    bounds: Corners | None = None
+    solid: SolidFile | None = None
+    physics: dict[str, Any]
+
+
+def read_scene(path: Path | str) -> FluidScene:
+    """Return the scene of a TOML file; `docs/own-scene.md` shows one.
+
+    Raises:
+        SceneError: The file cannot be read, has keys that mean nothing or values out of range, or the scene cannot be run.
+    """
+    path = Path(path)
+    try:
+        given = Own.model_validate(tomllib.loads(path.read_text(encoding="utf-8")))
+    except OSError as error:
+        raise SceneError(f"{path}: cannot be read ({error.strerror})") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise SceneError(f"{path}: is no TOML ({error})") from error
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in first["loc"]).removeprefix(".")
+        raise SceneError(f"{path}: {where}: {first['msg'].lower()}, got {first['input']!r}"[:300]) from error
+    try:
+        scene = _make(given, path)
+        check_scene(scene)
+    except SceneError as error:
+        raise SceneError(f"{path}: {error}") from error
+    return scene
+
+
+def _make(given: Own, path: Path) -> FluidScene:
+    dx, physics = given.spacing, _physics(given)
+    parts = []
+    for block in given.fill:
+        x = _fill(block, given, path)
+        v = np.zeros(x.shape[1]) if block.velocity is None else np.array(block.velocity)
+        if v.shape != x.shape[1:]:
+            raise SceneError(f"fill.velocity must have {x.shape[1]} numbers, got {block.velocity}")
+        parts.append((x, np.broadcast_to(v, x.shape), np.zeros(len(x))))
+    for way in given.inflow:
+        if len(way.velocity) != len(way.lower) or not any(way.velocity):
+            raise SceneError(f"inflow.velocity must have {len(way.lower)} numbers that are not all 0, got {way.velocity}")
+        parts.append(inflow(_cells(way.lower, way.upper, dx, "inflow"), way.velocity, dx, way.duration))
+    layers = int(np.ceil(KERNELS[physics.kernel].support * physics.smoothing / dx * (1 - 1e-12)))
+    walls = [_tank(each, dx, layers) for each in given.walls]
+    parts += [(x, np.zeros_like(x), np.zeros(len(x))) for x in walls]
+    if not parts or len({x.shape[1] for x, _, _ in parts}) != 1:
+        raise SceneError("fill, inflow and walls must hold particles, all in 2D or all in 3D")
+    x, v, enters = (np.concatenate(column) for column in zip(*parts, strict=True))
+    dim, dummies = x.shape[1], sum(map(len, walls))
+    return FluidScene(
+        name=path.stem,
+        positions=x,
+        velocities=np.array(v, float),
+        masses=np.full(len(x), physics.density * dx**dim),
+        spacing=dx,
+        duration=given.duration,
+        step=given.step,
+        wall=np.arange(len(x)) >= len(x) - dummies if dummies else None,
+        periodic=given.periodic and _periodic(given.periodic, dim),
+        bounds=given.bounds and Tank(tuple(given.bounds.lower), tuple(given.bounds.upper)),
+        enters=enters if given.inflow else None,
+        guided=max((layers * dx / float(np.linalg.norm(way.velocity)) for way in given.inflow), default=0.0),
+        outflow=given.outflow and Tank(tuple(given.outflow.lower), tuple(given.outflow.upper)),
+        solid=given.solid and _solid(given.solid, path),
+        physics=physics,
+    )
+
+
+def _periodic(box: Box, dim: int) -> Periodic:
+    if len(box.lower) != dim or len(box.upper) != dim:
+        raise SceneError(f"periodic: corners must have {dim} numbers, got {box.lower} and {box.upper}")
+    lengths = tuple((np.array(box.upper) - box.lower).tolist())
+    return Periodic(tuple(box.lower), lengths, tuple(axis in box.axes for axis in "xyz"[:dim]))
+
+
+def _physics(given: Own) -> Physics[float, tuple[float, ...]]:
+    told = {"smoothing": 1.5 * given.spacing, "pressure": "mean", "density_diffusion": 0.1} | given.physics
+    told |= {"gravity": tuple(told["gravity"])} if isinstance(told.get("gravity"), list) else {}
+    try:
+        physics: Any = Physics(**told)
+    except TypeError as error:
+        raise SceneError(f"physics: {str(error).partition(') ')[2] or error}") from error
+    check_physics(physics)
+    return physics
+
+
+def _cells(lower: Place, upper: Place, spacing: float, what: str) -> NDArray[np.float64]:
+    """Return centers of the cells of a box, as many as fit."""
+    counts = [round((high - low) / spacing) for low, high in zip(lower, upper, strict=False)]
+    if len(lower) != len(upper) or len(lower) not in (2, 3) or min(counts) < 1:
+        raise SceneError(f"{what}: from {lower} to {upper} there is no room for particles {spacing:g} m apart, in 2D or 3D")
+    return lattice(lower, counts, spacing)
+
+
+def _fill(block: Block, given: Own, path: Path) -> NDArray[np.float64]:
+    if block.file is None:
+        if block.lower is None or block.upper is None:
+            raise SceneError("fill: name a lower and an upper corner, or a file")
+        return _cells(block.lower, block.upper, given.spacing, "fill")
+    import trimesh
+
+    solid, dx = read_solid(path.parent / block.file, block.unit), given.spacing
+    low, high = solid.vertices.min(axis=0), solid.vertices.max(axis=0)
+    sites = _cells(low.tolist(), (low + np.maximum(np.ceil((high - low) / dx), 1) * dx).tolist(), dx, "fill")
+    mesh = trimesh.Trimesh(solid.vertices, solid.faces, process=False)
+    return sites[mesh.contains(sites)]
+
+
+def _tank(walls: Walls, spacing: float, layers: int) -> NDArray[np.float64]:
+    """Return dummies in layers around a box, without those of open sides."""
+    inner = _cells(walls.lower, walls.upper, spacing, "walls")
+    low, thick = np.array(walls.lower), layers * spacing
+    counts = np.round((inner.max(axis=0) - inner.min(axis=0)) / spacing).astype(int) + 1
+    high = low + counts * spacing
+    around = lattice((low - thick).tolist(), (counts + 2 * layers).tolist(), spacing)
+    outside = (around < low) | (around > high)
+    for k, axis in enumerate("xyz"[: len(low)]):
+        if f"-{axis}" in walls.open:
+            outside[around[:, k] < low[k]] = False
+        if f"+{axis}" in walls.open:
+            outside[around[:, k] > high[k]] = False
+    return around[outside.any(axis=1)]
+
+
+def _solid(given: SolidFile, path: Path) -> Solid:
+    solid = read_solid(path.parent / given.file, given.unit)
+    if given.rate is None:
+        return solid
+    axis = None if given.axis is None else tuple(given.axis)
+    return Solid(solid.vertices, solid.faces, Turning(tuple(given.center or (0.0, 0.0, 0.0)), axis, given.rate))
