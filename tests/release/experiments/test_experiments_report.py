@@ -40,6 +40,7 @@ def make_row(scene, method, seconds, megabytes, **options):
             "compared": "pairs",
             "density_error": 0.0,
             "jump_error": 0.01,
+            "others_cores": 0.0,
             "machine": MACHINE,
             "versions": VERSIONS,
         },
@@ -281,7 +282,17 @@ def test_a_sweep_without_figures_still_has_its_table(tmp_path):
     result = CliRunner().invoke(app, ["report", str(tmp_path)], catch_exceptions=False)
     assert result.exit_code == 0
     assert list(tmp_path.glob("*.png")) == []
-    assert "missing: not there" in (tmp_path / "report.md").read_text()
+    text = (tmp_path / "report.md").read_text()
+    assert "not installed: cll (make peers; " in text and "not there" not in text
+
+
+@pytest.mark.parametrize(("cores", "mark"), [(None, "°"), (0.1, ""), (0.4, "*")])
+def test_times_are_marked_beside_others_and_where_that_is_not_known(tmp_path, monkeypatch, cores, mark):
+    monkeypatch.setattr(_plots, "draw_all", lambda rows, folder, origin: [])
+    RowFile(tmp_path).append(make_row(SCENES[0], "cll", 0.25, 10.0, others_cores=cores))
+    result = CliRunner().invoke(app, ["report", str(tmp_path)], catch_exceptions=False)
+    assert f" {mark}0.2500 " in result.stdout
+    assert f"| {mark}0.2500 |" in (tmp_path / "report.md").read_text()
 
 
 def test_a_folder_without_rows(tmp_path):
