@@ -41,10 +41,7 @@ def run(config: Config, name: str, folder: Path, retry_failed: bool = False, sha
     }
     about, tasks = {"config": name, "config_hash": config.hash}, [task for _, task in sweep.tasks.values()]
     rows = fill(RowFile(folder), tasks, sweep.describe, retry_failed=retry_failed, about=about, begin=sweep.begin)
-    for name in (
-        "oracle",
-        "kernels",
-    ):  # what is done needs neither, and they take hundreds of megabytes; a later round makes them anew
+    for name in ("oracle", "kernels"):  # hundreds of megabytes, which a later round makes anew
         shutil.rmtree(folder / name, ignore_errors=True)
     return rows
 

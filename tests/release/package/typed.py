@@ -1,8 +1,6 @@
 """What types have to accept and to tell: `pyright` reads this file, nothing runs it."""
 # pyright: reportUnnecessaryTypeIgnoreComment=true
 
-# pyright: reportUnnecessaryTypeIgnoreComment=true
-
 from typing import assert_type
 
 import jax.numpy as jnp
