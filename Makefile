@@ -85,4 +85,4 @@ style: $(STAMP)
 	$(VENV)/bin/clang-format --dry-run -Werror kernels/native/*
 
 clean:
-	rm -rf $(VENV) .cache out build docs/notebooks docs/pictures *.egg-info
+	rm -rf $(VENV) .cache out build docs/api/objects docs/notebooks docs/pictures *.egg-info

@@ -71,10 +71,9 @@ def test_code_of_pages(group, ran):
 def test_pages_build(tmp_path):
     """With warnings as errors: links, anchors and cross-references are there, docstrings can be read, no page is left out."""
     run("-c", BUILD, "-W", "--keep-going", "--quiet", "--builder", "html", str(ROOT / "docs"), str(tmp_path))
-    html = {path.stem: path.read_text(encoding="utf-8") for path in (tmp_path / "api").glob("*.html")}
-    missing = [name for name in jfrnn.__all__ if f'id="jfrnn.{name}"' not in html["jfrnn"]]
-    missing += [name for name in distributed.__all__ if f'id="jfrnn.distributed.{name}"' not in html["distributed"]]
-    missing += [name for name in sph.__all__ if f'id="jfrnn.sph.{name}"' not in html["sph"]]
+    html = {path.stem: path.read_text(encoding="utf-8") for path in (tmp_path / "api" / "objects").glob("*.html")}
+    public = [f"{module.__name__}.{name}" for module in (jfrnn, distributed, sph) for name in module.__all__]
+    missing = [name for name in public if f'id="{name}"' not in html.get(name, "")]
     assert missing == []
 
 
