@@ -70,7 +70,7 @@ def _liquid() -> str:
 
 
 def _lead(platform: str) -> Callable[[], str]:
-    """Return how many times as fast as another library's our list is: vesin's on the thesis's full lattice, nvalchemi's on a GPU."""
+    """Return how many times as fast our list is as vesin's on the thesis's full lattice, or as nvalchemi's on a GPU."""
 
     def value() -> str:
         if platform == "cpu":
