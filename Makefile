@@ -58,7 +58,7 @@ notebooks: $(STAMP)
 
 # The pages of docs/, in out/docs; what is wrong in them is an error.
 docs: $(STAMP)
-	$(PY) -m sphinx -W --keep-going --quiet docs out/docs
+	$(PY) -m sphinx -W --keep-going docs out/docs
 	@echo out/docs/index.html
 
 # The library, whole: every engine, dtype, option and hard case against the oracle. What XLA compiled is kept in .cache for the next run.

@@ -44,6 +44,7 @@ STUDIES = HERE.parent / "notebooks"
 
 def setup(app):
     """Draw pictures, run the gallery, copy the notebooks, and keep Sphinx from reading formulas of docstrings as its own marks."""
+    print("drawing pictures, and running the programs of the gallery that changed: minutes the first time", flush=True)
     pictures.draw(HERE / "pictures")
     gallery.run(HERE / "gallery.md", HERE / "pictures" / "gallery")
     objects.write()

@@ -341,3 +341,12 @@ def test_rows_that_are_packed_come_before_those_that_were_added(tmp_path):
     file.append(new)
     file.append(replace(old, median_s=7.0))
     assert file.read() == [replace(old, median_s=7.0), new]
+
+
+def test_a_title_names_what_the_picture_shows_and_claims_nothing_beside_other_work():
+    found = {"full": {"warp": 1.0, "hashgrid": 0.5, "vesin": 3.0}}
+    assert _plots._only(found, ["warp", "vesin"]) == {"full": {"warp": 1.0, "vesin": 3.0}}
+    assert _look.headline(found, "fast", beside=True).startswith("Time of a search, measured beside other work")
+    assert "3 times as fast" in _look.headline(found, "fast") and "memory" in _look.headline(found, "lean", beside=True)
+    rows = [make_row(SCENES[0], "cll", 1.0, 1.0, others_cores=cores) for cores in (None, 0.4, 0.0)]
+    assert _plots._beside(rows) and not _plots._beside(rows[1:])
