@@ -5,10 +5,13 @@ PYTHON ?= python3
 VENV   := .venv
 PY     := $(VENV)/bin/python
 OUT    ?= out/thesis
+# What `make sweep` compares, and on which layouts of Table 6.1; METHODS= LAYOUTS= takes all that the config names, for hours.
+METHODS ?= warp,warp-counts,pair-sum,cll,hashgrid-plain,scipy-kdtree,vesin,matscipy,matscipy-neighbours,nvalchemi,freud
+LAYOUTS ?= corners,clusters2,clusters5,full
 # Of each row of the sweep; five tell how far two runs differ, and go on from what one has measured.
 PROCESSES ?= 1
 # That the repeats of a row may take [s]; `make sweeps` lets slow methods have all of theirs.
-MOST_SECONDS ?= 20
+MOST_SECONDS ?= 1
 STAMP  := $(VENV)/.installed
 # What pip and setuptools say of themselves in every set-up: that there is a newer pip, that root installs, how an editable install works.
 PIP    := PIP_DISABLE_PIP_VERSION_CHECK=1 PIP_ROOT_USER_ACTION=ignore PYTHONWARNINGS='ignore:Editable installation' $(PY) -m pip install --quiet
@@ -25,9 +28,16 @@ $(STAMP): pyproject.toml
 	$(PIP) --no-compile --editable . --group test
 	touch $@
 
-sweep: $(STAMP)
-	$(PY) -m experiments run experiments/configs/thesis.toml --out $(OUT) --processes $(PROCESSES) --most-seconds $(MOST_SECONDS)
+sweep: $(VENV)/.wheels
+	$(PY) -m experiments run experiments/configs/thesis.toml --out $(OUT) --processes $(PROCESSES) --most-seconds $(MOST_SECONDS) \
+	  --methods "$(METHODS)" --layouts "$(LAYOUTS)"
 	$(PY) -m experiments report $(OUT)
+
+# Methods of others that install without a compiler, one by one: what has no wheel for this machine is left out.
+$(VENV)/.wheels: $(STAMP)
+	$(PY) -c 'import tomllib; print(*tomllib.load(open("pyproject.toml", "rb"))["dependency-groups"]["wheels"], sep="\n")' | \
+	  while read -r each; do $(PIP) --only-binary :all: "$$each" 2> /dev/null || echo "no wheel of $$each for this machine: left out"; done
+	touch $@
 
 # Hours: five processes of each row of Table 6.1, then every other question, into the folders that the notebooks read.
 SWEEPS := orientation motion cluster_size domain cutoff order size size_large fill
@@ -48,7 +58,7 @@ notebooks: $(STAMP)
 
 # The pages of docs/, in out/docs; what is wrong in them is an error.
 docs: $(STAMP)
-	$(PY) -m sphinx -W --keep-going --quiet docs out/docs
+	$(PY) -m sphinx -W --keep-going docs out/docs
 	@echo out/docs/index.html
 
 # The library, whole: every engine, dtype, option and hard case against the oracle. What XLA compiled is kept in .cache for the next run.
@@ -75,4 +85,4 @@ style: $(STAMP)
 	$(VENV)/bin/clang-format --dry-run -Werror kernels/native/*
 
 clean:
-	rm -rf $(VENV) .cache out build docs/notebooks docs/pictures *.egg-info
+	rm -rf $(VENV) .cache out build docs/api/objects docs/notebooks docs/pictures *.egg-info

@@ -12,6 +12,7 @@ from pathlib import Path
 from setuptools import setup
 
 ROOT = Path(__file__).parent
+CHECKOUT = re.compile(r"<!-- checkout -->.*?<!-- end checkout -->\n*", re.DOTALL)  # of no use to whoever has a wheel
 LINK = re.compile(r"(!?)\[([^\]]*)\]\((?!https?://|#)([^)]+)\)")
 
 
@@ -22,7 +23,7 @@ def read_repository() -> str:
 
 
 def rewrite_links(text: str, repository: str) -> str:
-    """Return a README without links that lead nowhere outside of the repository."""
+    """Return a README without links that lead nowhere outside of the repository, and without what a checkout alone can do."""
 
     def replace(link: re.Match[str]) -> str:
         picture, shown, path = link.groups()
@@ -31,7 +32,7 @@ def rewrite_links(text: str, repository: str) -> str:
             return f"*{shown}*" if picture else f"{shown}{place}"
         return f"{picture}[{shown}]({repository}/{'raw' if picture else 'blob'}/main/{path})"
 
-    return LINK.sub(replace, text)
+    return LINK.sub(replace, CHECKOUT.sub("", text))
 
 
 def list_addresses(repository: str) -> dict[str, str]:

@@ -6,6 +6,9 @@ import sys
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent.parent))
+sys.path.insert(0, str(Path(__file__).parent))
+
+import objects
 
 import jfrnn
 from experiments.pages import gallery, pictures
@@ -33,7 +36,7 @@ html_title = f"jfrnn {release}"
 html_show_copyright = False
 html_show_sphinx = False
 html_static_path = ["_static"]
-html_css_files = ["wide.css"]
+html_css_files = ["pages.css"]
 
 HERE = Path(__file__).parent
 STUDIES = HERE.parent / "notebooks"
@@ -41,11 +44,15 @@ STUDIES = HERE.parent / "notebooks"
 
 def setup(app):
     """Draw pictures, run the gallery, copy the notebooks, and keep Sphinx from reading formulas of docstrings as its own marks."""
+    print("drawing pictures, and running the programs of the gallery that changed: minutes the first time", flush=True)
     pictures.draw(HERE / "pictures")
     gallery.run(HERE / "gallery.md", HERE / "pictures" / "gallery")
+    objects.write()
     (HERE / "notebooks").mkdir(exist_ok=True)
     for notebook in STUDIES.glob("*.ipynb"):
         shutil.copyfile(notebook, HERE / "notebooks" / notebook.name)
+    app.connect("source-read", objects.link)
+    app.connect("autodoc-process-signature", objects.shorten)
     app.connect("autodoc-process-docstring", _escape, priority=100)  # before Napoleon
 
 

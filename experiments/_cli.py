@@ -71,6 +71,9 @@ def run(
     most_seconds: Annotated[
         float | None, typer.Option(callback=positive, help="That repeats of a row may take [s], instead of the config's.")
     ] = None,
+    method_names: Annotated[str | None, typer.Option("--methods", help="A,B,C: instead of the config's.")] = None,
+    layouts: Annotated[str | None, typer.Option(help="A,B,C: instead of the config's, with its fills.")] = None,
+    fills: Annotated[str | None, typer.Option(help="0.02,0.1: of all layouts, instead of the config's.")] = None,
     shard: Annotated[str, typer.Option(help="K/N: every N-th scene from the K-th on, in OUT/shard-K-of-N.")] = "1/1",
 ) -> None:
     """Run a sweep, or go on with it: rows that are there are not measured again, unless less time cut their repeats short."""
@@ -78,14 +81,30 @@ def run(
         from experiments import _config, _sweep
 
         part, parts = _read_shard(shard)
-        given = _config.load(config)
-        asked = {"processes": processes, "most_seconds": most_seconds}
-        given = given.model_copy(update={name: value for name, value in asked.items() if value is not None})
+        asked = {"methods": _split(method_names), "layouts": _split(layouts), "fills": _split(fills)}
+        given = _config.narrow(_config.load(config), **asked, processes=processes, most_seconds=most_seconds)
         folder = out or Path("out") / config.stem
         folder = take_folder(folder if parts == 1 else folder / f"shard-{part}-of-{parts}")
         with stoppable():
             rows = _sweep.run(given, config.stem, folder, retry_failed, (part, parts))
         typer.echo(f"{_sweep.count_results(rows)}; rows in {folder / 'rows.jsonl'}")
+
+
+def _split(text: str | None) -> list[str] | None:
+    """Return the words between commas; None where there are none."""
+    return [word.strip() for word in text.split(",")] if text else None
+
+
+@app.command(short_help="Write a config to begin a sweep of your own with.")
+def init(path: Annotated[Path, typer.Argument(help="TOML file.")] = Path("sweep.toml")) -> None:
+    """Write a config of a small sweep, with every key, its default and what it means."""
+    with usage_errors():
+        from experiments import _keys
+
+        if path.exists():
+            raise UsageError(f"{path}: there is such a file already; name another")
+        take_file(path, "PATH").write_text(_keys.example(), encoding="utf-8")
+        typer.echo(f"{path}; run it: python -m experiments run {path}")
 
 
 def _read_shard(text: str) -> tuple[int, int]:

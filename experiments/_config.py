@@ -26,7 +26,7 @@ LIMITS = ("most_seconds", "timeout")  # when a row is given up, not what it meas
 class Table(BaseModel):
     """A table of a config: keys that it does not know are refused."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
 
 
 def _check_layout(name: str) -> str:
@@ -42,16 +42,23 @@ class Scenes(Table):
     """Every layout at every fill and whatever else is given several times; without fills, each layout at its own."""
 
     layouts: tuple[LayoutName, ...] = Field(min_length=1)
-    fills: tuple[Fill, ...] = ()  # shares of the full domain
-    spacings: tuple[Positive, ...] = ()  # instead of the config's, as are the next two
+    """Where particles are: `python -m experiments list` names all, `show LAYOUT` draws one."""
+    fills: tuple[Fill, ...] = ()
+    """Shares of the full domain; without them, each layout has its own."""
+    spacings: tuple[Positive, ...] = ()
+    """Instead of the config's spacing [m]."""
     cutoff_ratios: tuple[Positive, ...] = ()
+    """Instead of the config's cutoff_ratio."""
     seeds: tuple[Annotated[int, Field(ge=0)], ...] = ()
-    angles: tuple[FiniteFloat, ...] = ()  # of turnedN and cutN [degrees]
-    growths: tuple[Annotated[FiniteFloat, Field(ge=1)], ...] = ()  # of grownN: how many times larger the domain becomes
-    # Of the particles: as the layout has them, shuffled, or sorted by cells of a cutoff.
+    """Instead of the config's seed."""
+    angles: tuple[FiniteFloat, ...] = ()
+    """Of turnedN and cutN [degrees]."""
+    growths: tuple[Annotated[FiniteFloat, Field(ge=1)], ...] = ()
+    """Of grownN: how many times larger the domain becomes."""
     orders: tuple[Literal["layout", "shuffled", "sorted"], ...] = ()
-    # How far every particle goes between two searches, for methods that follow motion [spacings].
+    """Of the particles: as the layout has them, shuffled, or sorted by cells of a cutoff."""
     motions: tuple[Annotated[FiniteFloat, Field(ge=0)], ...] = ()
+    """How far every particle goes between two searches, for methods that follow motion [spacings]."""
 
     def scenes(self) -> Iterator[dict[str, Any]]:
         """Yield what each scene says, as fields of a `Spec`; what is not given is left out."""
@@ -71,10 +78,14 @@ def _check_method(name: str) -> str:
 class Repeats(Table):
     """How often something is timed."""
 
-    repeats: Annotated[int, Field(ge=1)] = 5  # fewest timed runs in a process
-    min_seconds: Annotated[FiniteFloat, Field(ge=0)] = 0.5  # runs go on until they took this long together [s] ...
-    max_repeats: Annotated[int, Field(ge=1)] = 50  # ... or until there are so many; 1: the first run is the only one
-    timeout: Timeout = 300.0  # a row's process is ended after this time [s]
+    repeats: Annotated[int, Field(ge=1)] = 5
+    """Fewest timed runs in a process."""
+    min_seconds: Annotated[FiniteFloat, Field(ge=0)] = 0.5
+    """Runs go on until they took this long together [s], or until there are max_repeats."""
+    max_repeats: Annotated[int, Field(ge=1)] = 50
+    """Most timed runs in a process; 1: the first run is the only one."""
+    timeout: Timeout = 300.0
+    """A row's process is ended after this time [s]."""
 
     @field_validator("max_repeats")
     @classmethod
@@ -87,17 +98,25 @@ class Repeats(Table):
 class Config(Repeats):
     """A sweep: scenes × methods, and how each row is measured."""
 
-    methods: tuple[Annotated[str, AfterValidator(_check_method)], ...] = Field(min_length=1)  # of experiments/methods
+    methods: tuple[Annotated[str, AfterValidator(_check_method)], ...] = Field(min_length=1)
+    """What is compared: `python -m experiments list` names all; a file of experiments/methods each."""
     scenes: tuple[Scenes, ...] = Field(min_length=1)
-    processes: Annotated[int, Field(ge=1)] = 1  # every row is measured in so many, each in a round of its own over all scenes
-    spacing: Positive = 1e-4  # distance of lattice neighbors [m]
-    cutoff_ratio: Positive = 3.0  # cutoff in spacings
-    dtype: Dtype = "float32"  # of the positions
+    """Tables [[scenes]], one after another."""
+    processes: Annotated[int, Field(ge=1)] = 1
+    """Every row is measured in so many, each in a round of its own over all scenes."""
+    spacing: Positive = 1e-4
+    """Distance of lattice neighbors [m]."""
+    cutoff_ratio: Positive = 3.0
+    """Cutoff in spacings."""
+    dtype: Dtype = "float32"
+    """Of the positions."""
     dim: Literal[2, 3] = 3
-    seed: Annotated[int, Field(ge=0)] = 0  # of random layouts
-    # No run begins when they took this long together, be they as few as they may [s]. Where a later sweep allows more, rows with
-    # too few repeats are measured again.
+    """Dimensions."""
+    seed: Annotated[int, Field(ge=0)] = 0
+    """Of random layouts."""
     most_seconds: Positive = 60.0
+    """No run begins when they took this long together, be they as few as they may [s]. Where a later sweep allows more, rows with
+    too few repeats are measured again."""
 
     @property
     def hash(self) -> str:
@@ -173,6 +192,28 @@ class Spec(Keyed):
     def is_cut_short(self, row: _rows.SearchRow) -> bool:
         """Whether a row has fewer repeats than asked, where `most_seconds` would have let another begin."""
         return row.status == "ok" and len(row.seconds) < self.repeats and sum(row.seconds) < self.most_seconds
+
+
+def narrow(config: Config, **asked: Any) -> Config:  # noqa: ANN401
+    """Return a config with other methods, layouts, fills and so on, where they are not None.
+
+    Layouts have the fills that the config gives them, their own where it names them nowhere, or those that are asked for.
+
+    Raises:
+        UsageError: What is asked for is not allowed.
+    """
+    asked = {name: value for name, value in asked.items() if value is not None}
+    layouts, fills = asked.pop("layouts", None), asked.pop("fills", None)
+    tables = [table.model_dump() for table in config.scenes]
+    if layouts is not None:
+        there = {name: [table for table in tables if name in table["layouts"]] or [{}] for name in layouts}
+        tables = [table | {"layouts": (name,)} for name, found in there.items() for table in found]
+    if fills is not None:
+        tables = [table | {"fills": fills} for table in tables]
+    try:
+        return Config.model_validate(config.model_dump() | asked | {"scenes": tables})
+    except ValidationError as error:
+        raise UsageError("\n".join(_explain(item, Config) for item in error.errors())) from error
 
 
 def digest(value: object) -> str:

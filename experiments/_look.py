@@ -152,14 +152,17 @@ def write_names(axes: Axes, ends: Sequence[tuple[str, float, float, str]]) -> No
         )
 
 
-def headline(found: dict[str, dict[str, float]], what: str, scenes: str = "scenes") -> str:
+def headline(found: dict[str, dict[str, float]], what: str, scenes: str = "scenes", beside: bool = False) -> str:
     """Say where our list stands among those of others, with factors.
 
     Args:
-        found: Of each scene the seconds or bytes of each method.
+        found: Of each scene the seconds or bytes of each method that the picture shows.
         what: `fast`, of seconds; `lean`, of bytes.
         scenes: What the keys of `found` are.
+        beside: Whether most times were measured beside other work, or nobody knows: they tell then which method is first to nobody.
     """
+    if beside and what == "fast":
+        return "Time of a search, measured beside other work or for too short to tell: who is first is not said"
     lists = {scene: {name: value for name, value in of.items() if name not in WITHOUT_LIST} for scene, of in found.items()}
     lists = lists if any(len(of) > 1 for of in lists.values()) else found
     present = {name for of in lists.values() for name in of}

@@ -73,13 +73,24 @@ def draw_all(rows: Sequence[SearchRow], folder: Path, origin: str) -> list[Path]
     return paths
 
 
+def _only(found: dict[str, dict[str, float]], chosen: Sequence[str]) -> dict[str, dict[str, float]]:
+    """Return what was found of the methods of a picture: its title is about nothing else."""
+    return {place: {name: value for name, value in of.items() if name in chosen} for place, of in found.items()}
+
+
+def _beside(rows: Sequence[SearchRow]) -> bool:
+    """Whether most times were measured beside other work, or for too short to tell."""
+    marked = sum(row.others_cores is None or row.others_cores > _table.NOTEWORTHY_CORES for row in rows)
+    return 2 * marked > len(rows)
+
+
 def by_layout(rows: Sequence[SearchRow], quantity: Quantity) -> Figure:
     """Draw a line per method over scenes, or over layouts where scenes are many."""
     whole, lines, found = _by_place(rows, quantity.value)
     names, shared = _shorten(whole)
     chosen = [name for name in _look.choose(_methods(rows)) if lines.get(name)]
     scenes = "layouts" if len({row.scene_key for row in rows}) > MOST_SCENES else "scenes"
-    figure, axes = _look.make_axes(_look.headline(found, quantity.what, scenes), 4.8)
+    figure, axes = _look.make_axes(_look.headline(_only(found, chosen), quantity.what, scenes, _beside(rows)), 4.8)
     _draw_lines(axes, lines, chosen)
     axes.set_xticks(range(len(names)), names, rotation=40, ha="right", fontsize=8, rotation_mode="anchor")
     axes.set(yscale="log", xlim=(-0.3, len(names) - 0.7), xlabel=shared, ylabel=quantity.label)
@@ -100,7 +111,8 @@ def by_fill(rows: Sequence[SearchRow], quantity: Quantity) -> Figure:
     means = {asked: {name: geometric_mean(values) for name, values in of.items()} for asked, of in found.items()}
     places = {asked: geometric_mean(values) for asked, values in fills.items()}
     chosen = _look.choose(name for name in _methods(filled) if any(name in of for of in means.values()))
-    figure, axes = _look.make_axes(f"{_look.headline(means, quantity.what, 'fills')} (means of layouts)", 4.4)
+    said = _look.headline(_only(means, chosen), quantity.what, "fills", _beside(filled))
+    figure, axes = _look.make_axes(f"{said} (means of layouts)", 4.4)
     ends = []
     for name in chosen:
         line = sorted((places[asked], of[name], found[asked][name]) for asked, of in means.items() if name in of)
@@ -128,14 +140,14 @@ def against_error(rows: Sequence[SearchRow], quantity: Quantity) -> Figure:
     exact = [row for row in lists.values() if not row.errors]
     wrong = [row for row in lists.values() if row.errors]
     title = f"{len(exact)} of {len(lists)} lists are exact" if len(lists) > 1 else f"{quantity.label.split(' [')[0]}".capitalize()
-    if exact and wrong:
+    if exact and wrong and not (quantity is TIME and _beside(scene)):
         shown = [row for row in exact if row.method in _look.choose(lists)] or exact
         best, other = (min(of, key=lambda row: quantity.value(row) or 0) for of in (shown, wrong))
         ratio = _look.factor((quantity.value(other) or 0) / (quantity.value(best) or 1))
         least, times = {"fast": ("fastest", "times as long as"), "lean": ("leanest", "times the memory of")}[quantity.what]
         title += f"; the {least} of the others, {_look.spoken(other.method)}, takes {ratio} {times} {_look.spoken(best.method)}"
     label = f"{quantity.label}; {scene[0].scene_name}, {_look.plain(scene[0].points or 0)} points" if scene else quantity.label
-    return _strip(scene, quantity.value, lambda row: row.errors, title, label, "missing and extra pairs")
+    return _strip(scene, quantity.value, lambda row: row.errors, title, label, "missing and extra pairs; fewer is better")
 
 
 def against_sum_error(rows: Sequence[SearchRow]) -> Figure:
@@ -147,7 +159,7 @@ def against_sum_error(rows: Sequence[SearchRow]) -> Figure:
     rounding = max((row.density_error or 0.0 for row in scene if row.method == "pair-sum"), default=0.0)
     title += f"; rounding changes the density of pair_sum by {rounding:.0e}" if rounding else ""
     label = f"{TIME.label}; {scene[0].scene_name}, {_look.plain(scene[0].points or 0)} points"
-    return _strip(scene, TIME.value, _sum_error, title, label, "error of a sum, over its mean")
+    return _strip(scene, TIME.value, _sum_error, title, label, "error of a sum, over its mean; less is better")
 
 
 def of_all(rows: Sequence[SearchRow], quantity: Quantity) -> Figure:

@@ -20,7 +20,6 @@ TITLES += ("thesis", "s", "/ CLL", "MB", "/ CLL")
 TEXT_COLUMNS = ("scene", "method", "thesis")
 PRINTED = ("s", "MB", "missing", "extra")
 ABSENT = "·"
-NOTEWORTHY_CORES = 0.25  # what other processes take beyond it is said: it slows down the methods that use all cores
 
 NOTES = """\
 - **s**: median time of a search, from raw positions to the finished result, without compilation; of several processes the median of
@@ -45,7 +44,7 @@ NOTES = """\
 - `warp`, `pair-sum`, `jax`, `brute`, `freud`, `pykdtree` and what runs inside JAX may use all cores, the others one thread. Lists
   hold each pair once or in both directions, as the method gives them.
 - `*`: other processes kept more than a quarter of a core busy meanwhile (`others_cores` in table.csv). Methods on all cores then
-  look slower than they are.
+  look slower than they are. `°`: the repeats took too little time together to tell whether other processes worked.
 - table.csv holds all times, compilation included; rows.jsonl all that was measured.
 """
 
@@ -87,7 +86,7 @@ def describe_origin(rows: Iterable[SearchRow]) -> str:
     versions = _distinct(", ".join(f"{name} {row.versions[name]}" for name in packages if row.versions.get(name)) for row in rows)
     commits = _distinct(f"commit {row.commit[:10]}{' with changes' if row.dirty else ''}" for row in rows if row.commit)
     others = max((row.others_cores or 0.0 for row in rows), default=0.0)
-    beside = [f"others kept up to {others:.1f} cores busy"] if others > NOTEWORTHY_CORES else []
+    beside = [f"others kept up to {others:.1f} cores busy"] if others > _table.NOTEWORTHY_CORES else []
     dates = sorted({row.time[:10] for row in rows if row.time})
     when = " to ".join(dict.fromkeys((dates[0], dates[-1]))) if dates else ""
     return " · ".join(" / ".join(part) for part in (machines, versions, commits, beside, [when]) if any(part))
@@ -113,7 +112,7 @@ def cells(line: dict[str, Any]) -> list[str]:
     return [
         *(line["scene"], _count(line["points"]), line["method"]),
         *(
-            _busy(line) + _seconds(line["median_s"]),
+            _table.busy_mark(line) + _seconds(line["median_s"]),
             _spread(line),
             _table.noise_mark(line) + _ratio(line["seconds_ratio"]),
             _megabytes(line["search_mb"]),
@@ -136,10 +135,6 @@ def _errors(line: dict[str, Any], name: str) -> str:
 
 def _relative(value: float | None) -> str:
     return ABSENT if value is None else f"{value:.1e}" if value else "0"
-
-
-def _busy(line: dict[str, Any]) -> str:
-    return "*" if (line["others_cores"] or 0.0) > NOTEWORTHY_CORES else ""
 
 
 def _seconds(value: float | None, digits: int = 4) -> str:
@@ -178,9 +173,7 @@ def rich_table(lines: list[dict[str, Any]]) -> Table:
     for title in PRINTED:
         table.add_column(title, justify="right", no_wrap=True)
     previous = None
-    for line in lines:
-        if line["status"] == "missing":
-            continue
+    for line in split_absent(lines)[0]:
         if line["scene"] != previous:
             if previous is not None:
                 table.add_section()
@@ -188,17 +181,26 @@ def rich_table(lines: list[dict[str, Any]]) -> Table:
             previous = line["scene"]
         wrong = [Text(_errors(line, name), "yellow" if line[name] else "") for name in ("missing", "extra")]
         ok = line["status"] == "ok"
-        seconds = _busy(line) + _seconds(line["median_s"]) if ok else line["status"]
+        seconds = _table.busy_mark(line) + _seconds(line["median_s"]) if ok else line["status"]
         table.add_row(f"  {line['method']}", seconds, _megabytes(line["search_mb"]), *wrong, style=None if ok else "dim")
     return table
 
 
-def remarks(lines: list[dict[str, Any]]) -> list[str]:
-    """Return what is to be said below the printed table: what is not installed, and what its marks mean, where they occur."""
+def split_absent(lines: list[dict[str, Any]]) -> tuple[list[dict[str, Any]], list[str]]:
+    """Return the lines of methods that are there, and what is said of the others: a line each would tell no more."""
     absent = dict.fromkeys(line["method"] for line in lines if line["status"] == "missing")
     said = [f"not installed: {', '.join(absent)} ({methods.HOW_TO_INSTALL})"] if absent else []
-    if any(_busy(line) for line in lines):
+    return [line for line in lines if line["status"] != "missing"], said
+
+
+def remarks(lines: list[dict[str, Any]]) -> list[str]:
+    """Return what is to be said below the printed table: what is not installed, and what its marks mean, where they occur."""
+    said = split_absent(lines)[1]
+    marks = {_table.busy_mark(line) for line in lines}
+    if "*" in marks:
         said.append("*: other processes kept more than a quarter of a core busy meanwhile, so that this time may be too long")
+    if "°" in marks:
+        said.append("°: repeats took too little time to tell whether other processes worked meanwhile")
     if any(_table.pairs_mark(line) for line in lines):
         said.append("~: told from counts of neighbors, or from a sample of the particles")
     return [*said, "s: median time of a search; MB: its peak memory, 10^6 bytes; missing, extra: pairs against the exact answer"]
@@ -215,10 +217,25 @@ def write_csv(lines: list[dict[str, Any]], path: Path) -> None:
 def markdown(rows: list[SearchRow], lines: list[dict[str, Any]], pictures: list[Path]) -> str:
     """Return report.md."""
     head = [" | ".join(titles(lines)), " | ".join(":---" if title in TEXT_COLUMNS else "---:" for title in TITLES)]
-    body = [" | ".join(cells(line)) for line in lines]
+    shown, absent = split_absent(lines)
+    body = [" | ".join(cells(line)) for line in shown]
     table = [f"| {text} |" for text in (*head, *body)]
-    failed = [(line, f"{line['status']}: " if line["status"] != "ok" else "") for line in lines if line["reason"]]
+    failed = [(line, f"{line['status']}: " if line["status"] != "ok" else "") for line in shown if line["reason"]]
     unfinished = [f"- {line['scene']}, {line['method']}: {status}{line['reason']}" for line, status in failed]
     reasons = ["## Rows, and processes of them, without figures", "", *unfinished, ""] if unfinished else []
     images = [f"![{path.stem.replace('_', ' ')}]({path.name})" for path in pictures]
-    return "\n".join([f"# Sweep {_title(rows)}", "", describe_origin(rows), "", *table, "", NOTES, *reasons, *images, ""])
+    return "\n".join(
+        [
+            f"# Sweep {_title(rows)}",
+            "",
+            describe_origin(rows),
+            "",
+            *table,
+            "",
+            *(f"{text}\n" for text in absent),
+            NOTES,
+            *reasons,
+            *images,
+            "",
+        ]
+    )

@@ -24,7 +24,7 @@ class Row:
     key: str  # digest of what is measured and how: rows with the same key replace each other
     status: str = "failed"  # or "ok", "missing", "timeout", "skipped"
     reason: str | None = None  # why the status is not ok; of several processes as one row, why some of them have no figures
-    others_cores: float | None = None  # that other processes kept busy meanwhile, on average; None below 0.2 s
+    others_cores: float | None = None  # that other processes kept busy meanwhile, on average; None where less than 0.2 s passed
     device: str | None = None  # where it ran
     versions: dict[str, str | None] = field(default_factory=dict)  # of Python and of packages
     machine: dict[str, Any] = field(default_factory=dict)  # processor, cores, memory [bytes], operating system

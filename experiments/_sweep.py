@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -30,7 +31,7 @@ def run(config: Config, name: str, folder: Path, retry_failed: bool = False, sha
     Args:
         config: The sweep.
         name: Name of the config, kept in the rows.
-        folder: Holds rows.jsonl and the exact pairs.
+        folder: Holds rows.jsonl, and until all rows are there the exact pairs.
         retry_failed: Whether rows that are missing, failed or ran out of time are measured again.
         shard: (k, n): only every n-th scene from the k-th on, with all its methods and processes, which are to be compared.
     """
@@ -39,7 +40,10 @@ def run(config: Config, name: str, folder: Path, retry_failed: bool = False, sha
         spec.key: (spec, Task((spec.key,), spec.scene_name, partial(sweep.measure, spec), spec.is_cut_short)) for spec in specs
     }
     about, tasks = {"config": name, "config_hash": config.hash}, [task for _, task in sweep.tasks.values()]
-    return fill(RowFile(folder), tasks, sweep.describe, retry_failed=retry_failed, about=about, begin=sweep.begin)
+    rows = fill(RowFile(folder), tasks, sweep.describe, retry_failed=retry_failed, about=about, begin=sweep.begin)
+    for name in ("oracle", "kernels"):  # hundreds of megabytes, which a later round makes anew
+        shutil.rmtree(folder / name, ignore_errors=True)
+    return rows
 
 
 def shard_specs(specs: Iterable[Spec], shard: tuple[int, int]) -> list[Spec]:

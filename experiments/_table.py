@@ -11,6 +11,7 @@ RowT = TypeVar("RowT", bound=SearchRow)
 
 YARDSTICKS = ("cll", "warp", "warp-counts", "warp-rebuild")
 """What ratios divide by: the first of these that a sweep has."""
+NOTEWORTHY_CORES = 0.25  # what other processes take beyond it is said: it slows down the methods that use all cores
 PARTS = ("t_tree", "t_ksearch", "t_frsearch", "t_processing")
 COLUMNS = (
     *(
@@ -103,6 +104,13 @@ def ratio(value: float | None, yardstick: float | None) -> float | None:
 def pairs_mark(line: dict[str, Any]) -> str:
     """Return what stands before the numbers of wrong pairs of a line: whether they were told from counts alone."""
     return "~" if line["compared"] in ("counts", "sample") else ""
+
+
+def busy_mark(line: dict[str, Any]) -> str:
+    """Return what stands before the time of a line: whether others worked meanwhile, or whether that could not be measured."""
+    if line["median_s"] is None:
+        return ""
+    return "°" if line["others_cores"] is None else "*" if line["others_cores"] > NOTEWORTHY_CORES else ""
 
 
 def noise_mark(line: dict[str, Any]) -> str:

@@ -99,16 +99,8 @@ def memory_plan(
 
     Nothing depends on where the particles are. For "warp" and "hashgrid" the plan adds the sizes of the arrays that they allocate,
     and works for platforms that this machine lacks. For "jax" and "brute" it is XLA's analysis of the program, compiled for these
-    shapes, which takes seconds; it excludes the 32 B per point that a sort of "jax" takes for a moment on CPU. Pair sums are
-    compiled too, with "warp" in a tenth of a second: they take the scratch of the search, two copies of the numbers that fn reads
-    of each j, one of those of each i (coordinates excluded), and the sums; in a gradient, two sums per coordinate.
-
-    The plan is that of open space. On a GPU "warp" takes no scratch for up to 4096 particles, unless their box is skewed or so
-    small that images must be told apart: then less than 400 kB.
-
-    It excludes what lists of some scenes keep in addition: for a batch 4 B per particle and query, for cutoffs per particle a
-    float each (with a skin two), for a box whose images must be told apart 1 B per slot (2 B from 257 images on) and 4 B per
-    particle and query, for species 4 B each, for exclusions 8 B per pair (of one image, 4·d B more) and 4 B per row.
+    shapes, which takes seconds. Pair sums are compiled too. The plan is that of open space; the guide "Memory"
+    (docs/guides/memory.md) tells what lists of batches, boxes, species and exclusions keep in addition.
 
     Args:
         n: Number of particles, from 0 to 2^31 - 32.

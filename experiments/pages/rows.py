@@ -47,6 +47,10 @@ def whole(value: object) -> str:
 
 
 def markdown(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Return a table; a head that begins with `>` is that of a column of numbers, which stands to the right."""
-    lines = [[head.lstrip("> ") for head in heads], ["---:" if head.startswith(">") else "---" for head in heads], *rows]
+    """Return a table; a head that begins with `>` is that of a column of numbers, which stands to the right.
+
+    No line ends within a number of a head.
+    """
+    titles = [re.sub(r"(?<=\d) (?=\d{3})", "\N{NO-BREAK SPACE}", head.lstrip("> ")) for head in heads]
+    lines = [titles, ["---:" if head.startswith(">") else "---" for head in heads], *rows]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)

@@ -69,6 +69,22 @@ def _liquid() -> str:
     return f"{number(ours / theirs)} times jax-md's steps per second among {whole(least)}"
 
 
+def _lead(platform: str) -> Callable[[], str]:
+    """Return how many times as fast our list is as vesin's on the thesis's full lattice, or as nvalchemi's on a GPU."""
+
+    def value() -> str:
+        if platform == "cpu":
+            rows = read("thesis_cpu/table.csv")
+            ours, theirs = (one(rows, layout="full", method=method) for method in ("warp", "vesin"))
+        else:
+            rows = [row for row in read("h200/rows.jsonl") if row["kind"] == "call" and row["points"] == 1_000_000]
+            ours, theirs = (one(rows, method=method) for method in ("jfrnn warp", "nvalchemi 0.5.0 cell_list"))
+        assert ours is not None and theirs is not None, platform
+        return f"{number(float(theirs['median_s']) / float(ours['median_s']), digits=2)} times"
+
+    return value
+
+
 def _density(what: str) -> Callable[[], str]:
     """Return milliseconds, or nanoseconds per particle, of a density of 64 million particles on one GPU."""
 
@@ -98,6 +114,8 @@ VALUES: dict[str, Callable[[], str]] = {
     "jet-steps": _jet("steps"),
     "jet-seconds": _jet("seconds"),
     "gpu-liquid": _liquid,
+    "lead-cpu": _lead("cpu"),
+    "lead-gpu": _lead("gpu"),
     "density-64m-ms": _density("ms"),
     "density-64m-ns": _density("ns"),
     "tree-disagrees": _tree_disagrees,

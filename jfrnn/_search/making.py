@@ -12,7 +12,7 @@ from jfrnn._search.geometry import ImageCodes
 from jfrnn._search.reverse import find_reverse
 from jfrnn._search.topology import make_topology
 from jfrnn._search.verlet import first_verlet
-from jfrnn._tracing import at_once, compile_program, own_transfers
+from jfrnn._tracing import Real, at_once, compile_program, own_transfers
 
 _CAPACITY_STEP = 8
 
@@ -22,7 +22,7 @@ def round_capacity(slots: int) -> int:
     return -(-slots // _CAPACITY_STEP) * _CAPACITY_STEP
 
 
-def count_capacity(inputs: Inputs, options: Options, slack: float) -> int:
+def count_capacity(inputs: Inputs, options: Options, slack: Real) -> int:
     """Count the neighbors of concrete positions; return a capacity of `slack` times the longest row."""
     with at_once(), own_transfers():
         known = count_few(inputs, options)

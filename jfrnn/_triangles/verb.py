@@ -32,9 +32,6 @@ def search_triangles(
     any size. Cost: O(particles + faces + candidates). The candidates of a particle are the triangles in its cell, whose edge is
     about the cutoff, or about a quarter of a larger triangle; in a tree, the triangles of nodes whose boxes hold it.
 
-    A static wall is sorted once: `TriangleList.update` reuses the list's cells or tree. A wall that moves as a whole stays static
-    if particle positions are given in its frame. A deformed wall is sorted again by `update(positions, vertices=...)`.
-
     Args:
         positions: Particle positions [length], shape [n, 3] or [n, 2], float32 or float64. n = 0 is allowed.
         vertices: Corners [length], shape [v, 3] or [v, 2], same dtype.
@@ -58,11 +55,8 @@ def search_triangles(
         Overflow of a given capacity, coordinates that are not finite and invalid vertex indices are known only from data: see
             `status`, `overflow` and `check`.
 
-    Memory: 4 B per slot and particle for the list; 100 to 132 B per triangle for the cells, which the list keeps, whatever the
-    sizes of the triangles and of space, or 30 B for the tree (float64: 56); while "warp" lists on CUDA 12 B per particle, 0.6 kB
-    per triangle (float64: 1.1; "bvh" at most 0.13) and at most 58 MB. Differentiable: the list is topology, without gradient; see
-    `TriangleList.closest`. Jit: yes, with capacity. vmap: yes, with capacity. `jax.shard_map`: yes, with distributed particles and
-    the wall on every device. Compilation: for each new number of particles, slots or faces; with "jax" it takes several seconds.
+    Jit and vmap: yes, with capacity. `jax.shard_map`: yes, with distributed particles and the wall on every device. Differentiable:
+    see `TriangleList.closest`. Memory and what compiles: the guide "Walls of triangles" (docs/guides/triangles.md).
     Source: strict cutoff (Peifle 2019, §2.2).
 
     >>> import jax.numpy as jnp, jfrnn

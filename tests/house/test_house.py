@@ -3,6 +3,7 @@
 import ast
 import doctest
 import importlib
+import inspect
 import re
 import subprocess
 import sys
@@ -200,6 +201,12 @@ def test_nothing_imports_experiments():
 def test_public_names():
     assert set(jfrnn.__all__) == PUBLIC
     assert all(getattr(jfrnn, name).__doc__ for name in PUBLIC)
+
+
+def test_docstrings_fit_where_an_editor_shows_them():
+    """What is longer stands in a guide, which the docstring names."""
+    lengths = {name: len(inspect.getdoc(getattr(jfrnn, name)).splitlines()) for name in PUBLIC}
+    assert {name: length for name, length in lengths.items() if length > 40} == {}
 
 
 IMPORT = """

@@ -16,13 +16,13 @@ from experiments.gpu.config import Config
 
 ROOT = Path(_commands.__file__).resolve().parent.parent
 CONFIGS = ROOT / "experiments" / "configs"
-TOP = ("run", "report", "tables", "merge", "list", "show", "export", "gpu", "bench", "sph")
+TOP = ("run", "init", "report", "tables", "merge", "list", "show", "export", "gpu", "bench", "sph")
 BENCH = (
     *("crossover", "crystals", "distributed", "arrays", "latency", "lj", "options", "peers", "skin", "start"),
     *("structures", "sums", "ties", "triangles"),
 )
 SPH = ("validate", "speed", "gradients")
-COMMANDS = (*TOP[:8], *(f"bench {name}" for name in BENCH), *(f"sph {name}" for name in SPH))
+COMMANDS = (*TOP[:9], *(f"bench {name}" for name in BENCH), *(f"sph {name}" for name in SPH))
 
 
 def refused(*arguments):

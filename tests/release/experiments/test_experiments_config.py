@@ -7,7 +7,7 @@ import pytest
 from places import ROOT
 from typer.testing import CliRunner
 
-from experiments import _config, _layouts, _rows, _sweep, _thesis, _worker, methods
+from experiments import _config, _keys, _layouts, _rows, _sweep, _thesis, _worker, methods
 from experiments._cli import app
 from experiments._errors import UsageError
 
@@ -39,6 +39,26 @@ def test_specs_are_the_product_of_scenes_and_methods(tmp_path):
         (layout, fill, method) for layout, fill in scenes for method in ("scipy-kdtree", "cll")
     ]
     assert len({spec.key for spec in specs}) == len(specs)
+
+
+def test_a_config_is_narrowed_and_what_is_asked_for_is_checked(tmp_path):
+    config = load(tmp_path, GOOD)
+    asked = _config.narrow(config, methods=["warp"], layouts=["full", "corners", "diagonal"], processes=2)
+    scenes = [("full", None), ("corners", 0.02), ("corners", 0.11), ("diagonal", None)]
+    assert [(spec.layout, spec.fill) for spec in asked.specs() if spec.process == 0] == scenes
+    assert {(spec.method, spec.process) for spec in asked.specs()} == {("warp", 0), ("warp", 1)}
+    assert [spec.fill for spec in _config.narrow(config, fills=["0.3"], methods=["cll"]).specs()] == [0.3] * 3
+    assert _config.narrow(config, methods=None) == config
+    with pytest.raises(UsageError, match="unknown method 'wrap'; allowed: "):
+        _config.narrow(config, methods=["wrap"])
+
+
+def test_the_config_to_begin_with_says_every_key(tmp_path):
+    config, text = load(tmp_path, _keys.example()), _keys.example()
+    commented = "\n".join(line.removeprefix("# ") if " = " in line else line for line in text.splitlines())
+    said = {name for kind in (_config.Config, _config.Scenes) for name in kind.model_fields} - {"scenes"}
+    assert {line.split(" = ")[0] for line in commented.splitlines() if " = " in line} == said
+    assert config.repeats == _config.Config.model_fields["repeats"].default
 
 
 def test_a_scene_given_twice_is_measured_once(tmp_path):

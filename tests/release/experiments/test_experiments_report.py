@@ -40,6 +40,7 @@ def make_row(scene, method, seconds, megabytes, **options):
             "compared": "pairs",
             "density_error": 0.0,
             "jump_error": 0.01,
+            "others_cores": 0.0,
             "machine": MACHINE,
             "versions": VERSIONS,
         },
@@ -281,7 +282,17 @@ def test_a_sweep_without_figures_still_has_its_table(tmp_path):
     result = CliRunner().invoke(app, ["report", str(tmp_path)], catch_exceptions=False)
     assert result.exit_code == 0
     assert list(tmp_path.glob("*.png")) == []
-    assert "missing: not there" in (tmp_path / "report.md").read_text()
+    text = (tmp_path / "report.md").read_text()
+    assert "not installed: cll (make peers; " in text and "not there" not in text
+
+
+@pytest.mark.parametrize(("cores", "mark"), [(None, "°"), (0.1, ""), (0.4, "*")])
+def test_times_are_marked_beside_others_and_where_that_is_not_known(tmp_path, monkeypatch, cores, mark):
+    monkeypatch.setattr(_plots, "draw_all", lambda rows, folder, origin: [])
+    RowFile(tmp_path).append(make_row(SCENES[0], "cll", 0.25, 10.0, others_cores=cores))
+    result = CliRunner().invoke(app, ["report", str(tmp_path)], catch_exceptions=False)
+    assert f" {mark}0.2500 " in result.stdout
+    assert f"| {mark}0.2500 |" in (tmp_path / "report.md").read_text()
 
 
 def test_a_folder_without_rows(tmp_path):
@@ -330,3 +341,12 @@ def test_rows_that_are_packed_come_before_those_that_were_added(tmp_path):
     file.append(new)
     file.append(replace(old, median_s=7.0))
     assert file.read() == [replace(old, median_s=7.0), new]
+
+
+def test_a_title_names_what_the_picture_shows_and_claims_nothing_beside_other_work():
+    found = {"full": {"warp": 1.0, "hashgrid": 0.5, "vesin": 3.0}}
+    assert _plots._only(found, ["warp", "vesin"]) == {"full": {"warp": 1.0, "vesin": 3.0}}
+    assert _look.headline(found, "fast", beside=True).startswith("Time of a search, measured beside other work")
+    assert "3 times as fast" in _look.headline(found, "fast") and "memory" in _look.headline(found, "lean", beside=True)
+    rows = [make_row(SCENES[0], "cll", 1.0, 1.0, others_cores=cores) for cores in (None, 0.4, 0.0)]
+    assert _plots._beside(rows) and not _plots._beside(rows[1:])

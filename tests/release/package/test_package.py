@@ -163,6 +163,7 @@ def test_links_and_pictures_of_a_package_page_lead_somewhere(wheel, tmp_path, re
     """One line of pyproject.toml makes them all; without it there are none that lead nowhere."""
     told = describe(tmp_path, repository) if repository else metadata(wheel)
     text = told.get_payload()
+    assert "make sweep" not in text and "\n## Cite\n" in text
     links = re.findall(r"(!?)\[[^\]]*\]\(([^)]+)\)", text)
     assert all(link.startswith(("https://", "#")) for _, link in links)
     assert told["Author"] == "jfrnn developers"
