@@ -145,7 +145,7 @@ def test_nothing_is_near_nothing(dtype, dim):
 @pytest.mark.parametrize(
     ("change", "error", "match"),
     [
-        ({"positions": [[0.0] * 3]}, TypeError, r"positions must be a JAX or NumPy array"),
+        ({"positions": "here"}, TypeError, r"positions must be a JAX or NumPy array"),
         ({"vertices": np.zeros((4, 2), np.float32)}, ValueError, r"vertices must match positions \(float32, 3 columns\)"),
         ({"vertices": np.zeros((4, 3))}, ValueError, r"vertices must match positions"),
         ({"faces": np.zeros((2, 3))}, TypeError, r"faces must be an array of integers of shape \[f, 3\], .* got float64"),
