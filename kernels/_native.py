@@ -36,6 +36,11 @@ def table_cells(sources: int) -> int:
     return min(max(SMALLEST_TABLE, CELLS_PER_PARTICLE * sources), 2**30)
 
 
+def place_parts(parts: list[int]) -> int:
+    """Return how many words parts of a scratch take, each of which begins at a multiple of 64 bytes."""
+    return sum((words + 15) // 16 * 16 for words in parts)
+
+
 def program(double: bool, dim: int, *headers: str, given: Mapping[str, str] = MappingProxyType({}), **constants: int) -> str:
     """Return the text of headers behind the constants of a variant.
 

@@ -7,7 +7,7 @@ themselves chunks of places from an atomic counter (see `native/walk_cpu.h`).
 
 import functools
 
-from jfrnn.kernels._native import BATCHES, SPACES, program, table_cells
+from jfrnn.kernels._native import BATCHES, SPACES, place_parts, program, table_cells
 from jfrnn.kernels._program import Kernel, declare
 
 CHUNK = 2048  # places that a thread takes at a time, where it puts them in order
@@ -33,7 +33,7 @@ def scratch_words(sources: int, queries: int, dim: int, width: int, own: bool, s
     parts = [_HEADER_WORDS, *[width * sources] * dim, sources, table + 2, max(sources, queries)]
     if not own:
         parts += [queries, table + 2]
-    return sum((words + 15) // 16 * 16 for words in parts)
+    return place_parts(parts)
 
 
 def grid_words(systems: int, width: int) -> int:

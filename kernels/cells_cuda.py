@@ -17,7 +17,7 @@ crossing the same in a periodic box, for queries whose reach leaves it: images t
 import functools
 from typing import NamedTuple
 
-from jfrnn.kernels._native import RULES, SPACES, program, table_cells
+from jfrnn.kernels._native import RULES, SPACES, place_parts, program, table_cells
 from jfrnn.kernels._program import Entry, Kernel, declare
 
 BLOCK = 256
@@ -42,7 +42,7 @@ GRID = {
     "WARPS": _WARPS,
     "MOST_KINDS": MOST_KINDS,
 }
-_HEADER_WORDS = 64
+HEADER_WORDS = 64  # of the scratch
 # Blocks of kernels that walk in strides, per multiprocessor: no result depends on how many there are.
 _SWEEP = 8  # over all particles
 _CROSSING = 64  # over queries whose reach leaves a box: how many there are is known to the device only
@@ -59,20 +59,16 @@ def scratch_words(sources: int, queries: int, dim: int, width: int, own: bool) -
     parts = [*_before_places(width), 4 * width * sources, table + 2, tiles, longest, longest, sources]
     if not own:
         parts += [table + 2, tiles, queries]
-    return _place_parts(parts)
+    return place_parts(parts)
 
 
 def place_words(width: int) -> tuple[int, int, int]:
     """Return where sources in the order of cells begin in the scratch, how many words each has, and which one is its number."""
-    return _place_parts(_before_places(width)), 4 * width, 3 * width
+    return place_parts(_before_places(width)), 4 * width, 3 * width
 
 
 def _before_places(width: int) -> list[int]:
-    return [_HEADER_WORDS, _PART * _PARTS * width]
-
-
-def _place_parts(parts: list[int]) -> int:
-    return sum((words + 15) // 16 * 16 for words in parts)
+    return [HEADER_WORDS, _PART * _PARTS * width]
 
 
 class Launch(NamedTuple):
@@ -152,6 +148,11 @@ def constants_of(rule: str) -> dict[str, int]:
     return {"RULE": RULES.index(rule), "SUM": rule == "mean", "SCALED": True}
 
 
+def walking_blocks(lists: bool, double: bool) -> int:
+    """Return how many blocks that list or count share a multiprocessor: registers against occupancy, as cells on an H200 want."""
+    return 24 if not lists else 16 if double else 20
+
+
 @functools.lru_cache(512)
 def cell_kernels(
     dim: int,
@@ -173,7 +174,7 @@ def cell_kernels(
     in a cutoff along y and z, `reach_x` along x; other numbers than these are slower, and only measurements ask for them.
     `rule`: one of `RULES`, where cutoffs differ.
     """
-    blocks = 24 if not lists else 16 if double else 20  # registers against occupancy, measured on an H200
+    blocks = walking_blocks(lists, double)
     kind = f"{dim}d_{'f64' if double else 'f32'}_r{reach}x{reach_x}"
     kind += SPACES[periodic] + "_batched" * batched
     variant = f"{kind}{'_scaled' * scaled}{'_list' * lists}{'_flat' * flat}{'_later' * later}{'_excluding' * excluding}"

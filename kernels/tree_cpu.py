@@ -12,7 +12,7 @@ import functools
 import itertools
 
 from jfrnn.kernels import cells_cpu
-from jfrnn.kernels._native import BATCHES, RULES, SPACES, program, table_cells
+from jfrnn.kernels._native import BATCHES, RULES, SPACES, place_parts, program, table_cells
 from jfrnn.kernels._program import Kernel, declare
 
 LEAF = 16  # sources of a leaf
@@ -38,7 +38,7 @@ def scratch_words(sources: int, queries: int, dim: int, width: int, own: bool, s
     parts = [64, *[width * sources] * dim, sources, table, most, queries, table]  # those of cells
     parts += [width * (sources + _MOST_LANES), sources + _MOST_LANES, sources, width * queries]
     parts += [*[width * (nodes + _MOST_LANES)] * (2 * dim + 1), most, most]
-    return sum((words + 15) // 16 * 16 for words in parts)
+    return place_parts(parts)
 
 
 PROVIDER = {"places_cpu.h": '#include "cutoffs_cpu.h"\n', "query_walk_cpu.h": '#include "cutoff_walk_cpu.h"\n'}  # in place of cells

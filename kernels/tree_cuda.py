@@ -10,12 +10,19 @@ Time follows pairs and particles: boxes are as small as 32 sources are close to 
 
 import functools
 
-from jfrnn.kernels._native import SPACES, program
+from jfrnn.kernels._native import SPACES, place_parts, program
 from jfrnn.kernels._program import Entry, Kernel, declare
-from jfrnn.kernels.cells_cuda import BLOCK, GRID, QUERY_BLOCK, constants_of, query_blocks
+from jfrnn.kernels.cells_cuda import (
+    BLOCK,
+    GRID,
+    HEADER_WORDS,
+    QUERY_BLOCK,
+    constants_of,
+    query_blocks,
+    walking_blocks,
+)
 
-_HEADER_WORDS = 64
-HEADER_BYTES = 4 * _HEADER_WORDS  # of the scratch, which are cleared first
+HEADER_BYTES = 4 * HEADER_WORDS  # of the scratch, which are cleared first
 _NODE_WORDS = 12  # of the box of a node, at most, in float32
 _LEAF = 32
 
@@ -31,8 +38,8 @@ def levels(sources: int) -> list[int]:
 def scratch_words(sources: int, queries: int, dim: int, width: int, own: bool) -> int:
     """Return the int32 words of scratch that the kernels need; `width` is 1 for float32 and 2 for float64."""
     del dim
-    parts = [_HEADER_WORDS, 4 * width * sources, 0 if own else queries, _NODE_WORDS * width * sum(levels(sources))]
-    return sum((words + 15) // 16 * 16 for words in parts)
+    parts = [HEADER_WORDS, 4 * width * sources, 0 if own else queries, _NODE_WORDS * width * sum(levels(sources))]
+    return place_parts(parts)
 
 
 @functools.lru_cache(512)
@@ -50,11 +57,6 @@ def fit_threads(sources: int, queries: int, own: bool) -> list[int]:
     return [threads[0] if own else max(threads[0], min(queries, 1 << 20)), *threads[1:]]
 
 
-def walk_constants(rule: str, periodic: int) -> dict[str, int]:
-    """Return the constants of a walk over a tree."""
-    return {**GRID, **constants_of(rule), "TREE": 1, "CROSSING": periodic > 0, "PERIODIC": periodic, "SHIFTED": periodic}
-
-
 def walk_threads(queries: int) -> int:
     """Return the threads that serve so many queries."""
     return query_blocks(queries) * QUERY_BLOCK
@@ -66,10 +68,10 @@ def query_kernel(
     excluding: int = 0, flat: bool = False,
 ) -> Kernel:  # fmt: skip
     """Return the kernel that lists or counts; the arguments are those of `jfrnn.kernels.cells_cuda.cell_kernels`."""
-    blocks = 24 if not lists else 16 if double else 20
     variant = f"{dim}d_{'f64' if double else 'f32'}{SPACES[periodic]}{'_batched' * batched}{'_list' * lists}{'_flat' * flat}"
     variant += f"{'_later' * later}{'_excluding' * excluding}_{rule}"
-    constants = {**walk_constants(rule, periodic), "BATCHED": batched, "LIST": lists, "FLAT": flat, "SUMS": 0, "LATER": later}
+    constants = {**GRID, **constants_of(rule), "TREE": 1, "CROSSING": periodic > 0, "PERIODIC": periodic, "SHIFTED": periodic}
+    constants |= {"BATCHED": batched, "LIST": lists, "FLAT": flat, "SUMS": 0, "LATER": later}
     text = program(double, dim, "rows.cuh", **constants, EXCLUDING=excluding)
-    entry = Entry("Rows.run", QUERY_BLOCK, blocks, "Rows_of_tree")
+    entry = Entry("Rows.run", QUERY_BLOCK, walking_blocks(lists, double), "Rows_of_tree")
     return declare(f"tree_cuda_{variant}", text, entry, cuda=True, fused=True)[0]

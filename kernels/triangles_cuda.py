@@ -27,7 +27,7 @@ thread asks 16 boxes one after the other for each node (experiments/results/tria
 import functools
 from typing import NamedTuple
 
-from jfrnn.kernels._native import program
+from jfrnn.kernels._native import place_parts, program
 from jfrnn.kernels._program import Entry, Kernel, declare
 from jfrnn.kernels._triangles import constants, pending
 
@@ -52,7 +52,7 @@ def scratch_words(n: int, buckets: int, entries: int, dim: int, double: bool) ->
     """Return the int32 words of scratch that the kernels need."""
     entry = (2 if double else 1) * 2 * (dim + 1)
     parts = [_HEADER_WORDS, buckets, n, n, n, entries * entry, workers_for(n, double) * constants(dim, double, 32)["ROOM"]]
-    return sum((words + 15) // 16 * 16 for words in parts)
+    return place_parts(parts)
 
 
 class Kernels(NamedTuple):

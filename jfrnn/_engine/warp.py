@@ -46,7 +46,8 @@ _CELLS = {"cpu": cells_cpu, "cuda": cells_cuda}
 QUERIES_PER_THREAD = 1024  # on the CPU, at least: among 1000, to wake a second thread takes as long as it saves
 
 # Of cutoffs that differ, on CUDA: how many sources within the largest cutoff a query may meet among cells, and how many more for
-# each that is near, before a tree is faster (measured on an H200); and how many queries and sources tell.
+# each that is near, before a tree is searched; and how many queries and sources tell. The first two were measured on an H200 for a
+# walker that trees have replaced, and that was slower: where a tree begins to be faster has not been measured.
 MOST_MET, MOST_MORE, SAMPLED = 2000, 8, (1024, 4096)
 Found = TypeVar("Found")  # what a search or a sum returns
 

@@ -20,7 +20,7 @@ from jfrnn.cases.radii import RADII_CASES
 
 SLOW = pytest.mark.slow
 LENGTH, CAPACITY = 160, 256  # more pairs than are all tested by "jax"
-# How a case is lengthened: a few are all tested, more are sorted into cells or a tree, and beside a crowd it is always a tree.
+# How a case is lengthened: a few are all tested, more are sorted into cells or a tree; beside a crowd it is a tree, on a CPU.
 CROWD, LENGTHS = 400, {"few": LENGTH, "more": 192, "crowd": 640}
 KINDS = {"gather": (np.float64, 2), "scatter": (np.float32, 2), "either": (np.float32, 3), "both": (np.float32, 3)}
 KINDS["mean"] = (np.float64, 3)

@@ -101,3 +101,22 @@ def test_derivatives(rule, second):
     along = tangents_of(args)
     expected = oracle(smooth_slopes, pairs, dict(zip(("x", "m", "lengths"), args)), along if second else None, scale=0.7)
     assert_same(everything(sums, second)(args, along), expected)
+
+
+def test_a_box_that_no_pair_crosses_though_particles_lie_boxes_apart():
+    """The shift of a pair is then that of its particles' boxes, and a derivative in the edges asks for it."""
+    random, n, edges = np.random.default_rng(0), 300, np.array([64.0, 128.0, 64.0])
+    near, boxes = 4 + 4 * random.random((n, 3)), random.integers(-1, 2, (n, 3)).astype(float)
+    radii, x = random.uniform(0.2, 1.0, n), near + boxes * edges
+
+    def sums(edges):
+        return fused(lambda r, i, j: r @ r, x, radii, box=jfrnn.Box(edges)).sum()
+
+    r = near[None] - near[:, None]
+    square = (r**2).sum(axis=-1)
+    pairs = (square < radii[:, None] ** 2) & ~np.eye(n, dtype=bool)
+    shifts = boxes[:, None] - boxes[None]
+    expected = (2 * r * shifts * pairs[..., None]).sum(axis=(0, 1))
+    found, slopes = jax.jit(jax.value_and_grad(sums))(jnp.asarray(edges))
+    np.testing.assert_allclose(found, square[pairs].sum(), rtol=1e-10)
+    np.testing.assert_allclose(slopes, expected, rtol=1e-9)
