@@ -6,6 +6,7 @@ NumPy integer takes part in a decision.
 """
 
 import math
+from bisect import bisect_left, bisect_right
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
 from fractions import Fraction
@@ -88,7 +89,8 @@ def reference_images(
     non-zero component is positive. With `queries` nothing is left out, and `half` and `include_self` are refused. A
     point that is not finite is in no pair.
 
-    Cost: all queries times all sources; 300 points in a box six cutoffs wide take a sixth of a second.
+    Cost: all queries times the sources in a slab of two cutoffs around each; 300 points in a box six cutoffs wide take a tenth of a
+    second.
 
     Why nothing is missed: let b_1 ... b_p be the periodic rows and w_k a vector orthogonal to b_1 ... b_(k-1), with
     b_k w_k > 0, which Gram-Schmidt makes of b_k in integers if the rows are independent. Along w_k, a pair's vector
@@ -100,29 +102,11 @@ def reference_images(
     dim = sources.shape[1]
     if len(periodic) != dim or not all(isinstance(axis, bool | np.bool_) for axis in periodic):
         raise ValueError(f"periodic must be one bool for each of {dim} axes: got {periodic}")
-    axes = [k for k in range(dim) if periodic[k]]
-    rows = _rows(matrix, sources.dtype, dim)[axes]
+    rows = _rows(matrix, sources.dtype, dim)[list(map(bool, periodic))]
     edge, (vectors, ends, starts) = _integers(_rounded(cutoff, sources.dtype), rows, sources, asking)
-    if len(vectors) < len(axes):
-        raise ValueError(f"periodic rows of the matrix must be finite: got {rows.tolist()}")
-    levels = _levels(list(vectors.values()), edge)
-    limit = edge**2 if closed else edge**2 - 1  # of integers: d2 < r2 is d2 <= r2 - 1
-    zero = (0,) * dim
-    found = set()
-    for (i, (x, y, z)), (j, (u, v, w)) in product(starts.items(), ends.items()):
-        if queries is None and j < i:
-            continue  # the negative vectors of (j, i) are as long: they are added there
-        for steps in _shifts((u - x, v - y, w - z), levels, limit):
-            shift = zero
-            if any(steps):
-                moved = dict(zip(axes, steps, strict=True))
-                shift = tuple(moved.get(k, 0) for k in range(dim))
-            if queries is None and i == j and ((shift == zero and not include_self) or (half and shift < zero)):
-                continue
-            found.add((i, j, shift))
-            if queries is None and i < j and not half:
-                found.add((j, i, tuple(-s for s in shift)))
-    return found
+    steps = _periodic_vectors(vectors, rows, periodic)
+    options = {"own": queries is None, "half": half, "include_self": include_self}
+    return {image for image, _ in _images(edge, closed, steps, ends, starts, **options)}
 
 
 def reference_radii(
@@ -145,28 +129,25 @@ def reference_radii(
     S is 0 without `lengths` [d], those of a periodic box, or `matrix` and `periodic`, which with `half` are as in
     `reference_images`. Without `queries`, (i, i, 0) is left out.
 
-    Found among the images within the largest cutoff of all; then 4 |x_j - x_i + S·A|^2 is compared with (2 r)^2 in fractions.
+    Found among the images within the largest cutoff of all; then 4 |x_j - x_i + S·A|^2 is compared with (2 r)^2 in integers.
     """
-    points = _points(positions)
-    largest = float(np.max([*np.asarray(radii), *([] if query_radii is None else np.asarray(query_radii))]))
-    cell, dim = lengths if matrix is None else matrix, points.shape[1]
-    flags = (cell is not None,) * dim if periodic is None else periodic
-    options = {"matrix": np.ones(dim) if cell is None else cell, "periodic": flags}
-    nearby = reference_images(points, largest, queries=queries, half=half, closed=True, **options)
-    rows = np.asarray(np.zeros(dim) if cell is None else cell, points.dtype)
-    rows = np.diag(rows) if rows.ndim == 1 else rows
-    given = [points, points if queries is None else _points(queries), rows, np.asarray(radii)[None]]
-    given.append(given[-1] if query_radii is None else np.asarray(query_radii)[None])
-    ends, starts, rows, (of_end,), (of_start,) = _whole(*given)
+    sources, asking = _clouds(positions, queries, half)
+    dim, own = sources.shape[1], queries is None
+    cell = np.zeros(dim) if lengths is None and matrix is None else lengths if matrix is None else matrix
+    flags = [lengths is not None or matrix is not None] * dim if periodic is None else periodic
+    rows = _rows(cell, sources.dtype, dim)[list(map(bool, flags))]
+    cutoffs = [np.asarray(each)[None] for each in (radii, radii if query_radii is None else query_radii)]
+    largest = _rounded(max(float(each.max()) for each in cutoffs), sources.dtype)
+    edge, (vectors, ends, starts, *of_points) = _integers(largest, rows, sources, asking, *cutoffs)
+    of_end, of_start = (numbers[0] for numbers in of_points)
     found = set()
-    for i, j, shift in nearby:
-        own, other = of_start[i], of_end[j]
-        double = {"gather": 2 * own, "scatter": 2 * other, "either": 2 * max(own, other), "both": 2 * min(own, other)}
-        limit = (own + other if rule == "mean" else double[rule]) ** 2
-        moved = [sum(s * row[k] for s, row in zip(shift, rows, strict=True)) for k in range(dim)]
-        square = 4 * sum((y - x + v) ** 2 for x, y, v in zip(starts[i], ends[j], moved, strict=True))
-        if square < limit or (closed and square == limit):
-            found.add((i, j, shift))
+    for image, square in _images(edge, True, _periodic_vectors(vectors, rows, flags), ends, starts, own=own, half=half):
+        i, j, _ = image
+        mine, other = of_start[i], of_end[j]
+        double = {"gather": 2 * mine, "scatter": 2 * other, "either": 2 * max(mine, other), "both": 2 * min(mine, other)}
+        limit = (mine + other if rule == "mean" else double[rule]) ** 2
+        if 4 * square < limit or (closed and 4 * square == limit):
+            found.add(image)
     return found
 
 
@@ -402,13 +383,6 @@ def _integers(cutoff: float, *clouds: np.ndarray) -> tuple[int, list[dict[int, l
     return top * (scale // bottom), scaled
 
 
-def _whole(*tables: np.ndarray) -> list[list[list[int]]]:
-    """Return tables of floats in a unit of which all are multiples, so that comparing them takes whole numbers alone."""
-    ratios = [[[x.as_integer_ratio() for x in row] for row in table.tolist()] for table in tables]
-    unit = max((below for table in ratios for row in table for _, below in row), default=1)  # denominators are powers of two
-    return [[[above * (unit // below) for above, below in row] for row in table] for table in ratios]
-
-
 def _within(cutoff: float, queries: np.ndarray, sources: np.ndarray, closed: bool, once: bool = False) -> Iterator[Pair]:
     """Yield every (query i, source j) within the cutoff: by integer cells of that edge, then by squared distance.
 
@@ -432,6 +406,70 @@ def _dot(a: Sequence[Any], b: Sequence[Any]) -> Any:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
+def _periodic_vectors(vectors: dict[int, list[int]], rows: np.ndarray, periodic: Sequence[bool]) -> list[list[int] | None]:
+    """Return the lattice vector of each axis in integers, None where it is not periodic."""
+    if len(vectors) < len(rows):
+        raise ValueError(f"periodic rows of the matrix must be finite: got {rows.tolist()}")
+    of_rows = iter(vectors.values())
+    return [next(of_rows) if axis else None for axis in periodic]
+
+
+def _images(
+    edge: int,
+    closed: bool,
+    vectors: list[list[int] | None],
+    ends: dict[int, list[int]],
+    starts: dict[int, list[int]],
+    *,
+    own: bool,
+    half: bool,
+    include_self: bool = False,
+) -> Iterator[tuple[Image, int]]:
+    """Yield every image within the cutoff and its squared distance, in integers, as `reference_images` says."""
+    axes = [k for k, vector in enumerate(vectors) if vector is not None]
+    levels = _levels([vector for vector in vectors if vector is not None], edge)
+    limit = edge**2 if closed else edge**2 - 1  # of integers: d2 < r2 is d2 <= r2 - 1
+    zero = (0,) * len(vectors)
+    for i, j, between in _in_slabs(edge, levels, ends, starts):
+        if own and j < i:
+            continue  # the negative vectors of (j, i) are as long: they come with those of (i, j)
+        for steps, square in _shifts(between, levels, limit):
+            shift = zero
+            if any(steps):
+                moved = dict(zip(axes, steps, strict=True))
+                shift = tuple(moved.get(k, 0) for k in range(len(vectors)))
+            if own and i == j and ((shift == zero and not include_self) or (half and shift < zero)):
+                continue
+            yield (i, j, shift), square
+            if own and i < j and not half:
+                yield (j, i, tuple(-s for s in shift)), square
+
+
+def _in_slabs(
+    edge: int, levels: list["Level"], ends: dict[int, list[int]], starts: dict[int, list[int]]
+) -> Iterator[tuple[int, int, Vector]]:
+    """Yield i, j and x_j - x_i of those that are near each other along one direction: the first axis, or the last level's normal.
+
+    Along that normal, images of j lie a height apart. One of them is within the reach of i only where what is left of the
+    components after division by the height differs by no more than the reach, or by no less than the height without it.
+    """
+    normal, height, reach = ((1, 0, 0), None, edge) if not levels else levels[-1][1:]
+    sites = sorted((_dot(x, normal) if height is None else _dot(x, normal) % height, j, x) for j, x in ends.items())
+    along = [site[0] for site in sites]
+    for i, (x, y, z) in starts.items():
+        here = _dot((x, y, z), normal)
+        if height is None:
+            parts = [(here - reach, here + reach)]
+        elif 2 * reach + 1 >= height:
+            parts = [(0, height)]
+        else:
+            here %= height
+            parts = [(here + k * height - reach, here + k * height + reach) for k in (-1, 0, 1)]
+        for low, high in parts:
+            for _, j, (u, v, w) in sites[bisect_left(along, low) : bisect_right(along, high)]:
+                yield i, j, (u - x, v - y, w - z)
+
+
 Level = tuple[Vector, Vector, int, int]
 """A lattice vector b, a normal w to those before it, b w, and the largest |v w| of a v within the cutoff."""
 
@@ -451,19 +489,19 @@ def _levels(rows: list[Vector], edge: int) -> list[Level]:
     return levels
 
 
-def _shifts(v: Vector, levels: list[Level], limit: int) -> Iterator[tuple[int, ...]]:
-    """Yield the shifts, one integer per lattice vector, that bring v to a squared length of at most `limit`."""
+def _shifts(v: Vector, levels: list[Level], limit: int) -> Iterator[tuple[tuple[int, ...], int]]:
+    """Yield the shifts, one integer per lattice vector, that bring v to a squared length of at most `limit`, and that length."""
     if not levels:
-        if _dot(v, v) <= limit:
-            yield ()
+        if (square := _dot(v, v)) <= limit:
+            yield (), square
         return
     *rest, (row, normal, height, reach) = levels
     here = _dot(v, normal)
     for s in range(-((reach + here) // height), (reach - here) // height + 1):
         moved = [x + s * step for x, step in zip(v, row, strict=True)] if s else v
         if not rest:
-            if _dot(moved, moved) <= limit:
-                yield (s,)
+            if (square := _dot(moved, moved)) <= limit:
+                yield (s,), square
             continue
-        for others in _shifts(moved, rest, limit):
-            yield (*others, s)
+        for others, square in _shifts(moved, rest, limit):
+            yield (*others, s), square

@@ -5,7 +5,7 @@ import functools
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array, lax
+from jax import Array
 
 from jfrnn._engine.launch import Call, Shapes, kernel
 from jfrnn._engine.operands import (
@@ -33,6 +33,7 @@ from jfrnn._engine.variants import (
     size_numbers,
 )
 from jfrnn._geometry import Cutoffs, Lattice, Wrapped, most_cells, unpack_turns
+from jfrnn._tracing import on_platform
 from jfrnn.kernels import boxes, cells_cpu, pair_sum_cpu, tree_cpu
 from jfrnn.kernels._native import EXCLUDED, OWN_BOXES, TABLE
 from jfrnn.kernels.pair_sum_cpu import TermText
@@ -59,7 +60,7 @@ def box_neighbors(search: Search, keep: Filter, capacity: int | Room | None) -> 
         given += [*excluded_rows(search), *_cutoffs_of_pairs(search, given[_GIVEN.index("ids")])]
         return _cuda_callable(variant)(*given, *starts, output_dims=dims)
 
-    *written, count, info = lax.platform_dependent(search, *starts, cpu=on_cpu, cuda=on_cuda)
+    *written, count, info = on_platform(search, *starts, cpu=on_cpu, cuda=on_cuda)
     return found_rows(written, count, info[0], capacity)
 
 
@@ -246,7 +247,7 @@ def box_sums(
         call_sums = _cuda_sum_callable(variant_on(True), term)
         return results.unpack(*call_sums(*given, output_dims=results.dims() | {"info": 2})[: len(_SUMS)])
 
-    return lax.platform_dependent(search._replace(checks={}), shared, own, others, cpu=on_cpu, cuda=on_cuda)
+    return on_platform(search._replace(checks={}), shared, own, others, cpu=on_cpu, cuda=on_cuda)
 
 
 def _sorted_columns(search: Search, term: TermText, others: Array, ids: Array) -> Array:

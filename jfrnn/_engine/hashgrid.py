@@ -7,14 +7,13 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-from jax import lax
-
 from jfrnn._engine.launch import Call, Shapes, kernel
 from jfrnn._engine.plans import Clear, Kept, Launch, Plan
 from jfrnn._engine.problem import Kind, Options, Room, Rows, Search
 from jfrnn._engine.start import INSTALL, load_warp
 from jfrnn._engine.variants import Variant, absent, describe_call, huge_pages, plan_numbers
 from jfrnn._engine.warp import call_kernels, check_platform, missing
+from jfrnn._tracing import on_platform
 from jfrnn.kernels import _clang, hashgrid
 
 HashGrid = Any  # the type of Warp, which cannot be named before it is imported
@@ -61,7 +60,7 @@ class HashGridEngine:
 
             return functools.partial(call_kernels, hashgrid.scratch_words, make, keep=options.filter, capacity=capacity)
 
-        return lax.platform_dependent(search._replace(checks={}), cpu=on(False), cuda=on(True))
+        return on_platform(search._replace(checks={}), cpu=on(False), cuda=on(True))
 
     def scratch_bytes(self, platform: str, n: int, m: int, dim: int, double: bool, own: bool, scaled: bool) -> int:
         """Return the scratch that the kernels are given, and what Warp allocates for the grid [B]."""

@@ -8,13 +8,14 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array, lax
+from jax import Array
 
 from jfrnn._engine.launch import Call, Shapes, kernel
 from jfrnn._engine.operands import lattice_numbers
 from jfrnn._engine.plans import Clear, Launch, Plan, ask_for_huge_pages, share
 from jfrnn._engine.sum_results import FoundSums, SumsOf
 from jfrnn._geometry import EXCHANGED, LARGEST_TURN, Cutoff, Cutoffs, Lattice
+from jfrnn._tracing import on_platform
 from jfrnn.kernels import kept
 from jfrnn.kernels.pair_sum_cpu import TermText
 
@@ -59,7 +60,7 @@ def kept_mask(given: KeptList) -> Array:
     def on(cuda: bool) -> Callable[[KeptList], Array]:
         return lambda given: _measure(given, cuda, False)["mask"]
 
-    return lax.platform_dependent(given, cpu=on(False), cuda=on(True))
+    return on_platform(given, cpu=on(False), cuda=on(True))
 
 
 def kept_distances(given: KeptList) -> tuple[Array, Array]:
@@ -72,7 +73,7 @@ def kept_distances(given: KeptList) -> tuple[Array, Array]:
 
         return call
 
-    return lax.platform_dependent(given, cpu=on(False), cuda=on(True))
+    return on_platform(given, cpu=on(False), cuda=on(True))
 
 
 def _measure(given: KeptList, cuda: bool, measured: bool) -> dict[str, Array]:
@@ -95,7 +96,7 @@ def kept_slopes(given: KeptList, slots: Array, distances: Array, slopes: Array) 
 
         return call
 
-    return lax.platform_dependent(given, slots, distances, slopes, cpu=on(False), cuda=on(True))
+    return on_platform(given, slots, distances, slopes, cpu=on(False), cuda=on(True))
 
 
 def kept_sums(
@@ -128,7 +129,7 @@ def kept_sums(
 
         return call
 
-    return lax.platform_dependent(given, values, cpu=on(False), cuda=on(True))
+    return on_platform(given, values, cpu=on(False), cuda=on(True))
 
 
 class _Extra(NamedTuple):

@@ -7,7 +7,7 @@ import jax
 from jax import lax
 
 from jfrnn._geometry import Sorting
-from jfrnn._tracing import Internal, Tree, platform_of_lowering
+from jfrnn._tracing import Internal, Tree, on_platform
 
 WORD_BYTES = 24  # what a word of 16 candidates takes while it is tested
 SLOT_BYTES = 16  # what a slot of a row takes while it is filled
@@ -74,10 +74,7 @@ def by_platform(make: Callable[[Tuning], Callable[[Operands], Tree]], operands: 
     Operands that are known while tracing, such as cutoffs, are hidden from the compiler, which would else make another program of
     another size where they are constants than where they are arguments.
     """
-    operands, platform = lax.optimization_barrier(operands), platform_of_lowering()
-    if platform is not None:
-        return make(CPU if platform == "cpu" else _fit_memory(ACCELERATOR))(operands)
-    return lax.platform_dependent(operands, cpu=make(CPU), default=make(_fit_memory(ACCELERATOR)))
+    return on_platform(lax.optimization_barrier(operands), cpu=make(CPU), default=make(_fit_memory(ACCELERATOR)))
 
 
 def _fit_memory(tuning: Tuning) -> Tuning:

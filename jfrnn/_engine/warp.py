@@ -39,9 +39,10 @@ from jfrnn._engine.variants import (
     split_rows,
 )
 from jfrnn._geometry import Cutoffs
+from jfrnn._tracing import on_platform
 from jfrnn.kernels import Kernel, _driver, cells_cpu, cells_cuda, few_cuda, tree_cpu, tree_cuda
 
-PLATFORMS = {"cpu": "cpu", "gpu": "cuda", "cuda": "cuda"}  # names in JAX, names in lax.platform_dependent
+PLATFORMS = {"cpu": "cpu", "gpu": "cuda", "cuda": "cuda"}  # names in JAX, names of branches
 _CELLS = {"cpu": cells_cpu, "cuda": cells_cuda}
 QUERIES_PER_THREAD = 1024  # on the CPU, at least: among 1000, to wake a second thread takes as long as it saves
 
@@ -79,7 +80,7 @@ class WarpEngine:
             cells = functools.partial(call_kernels, cells_cuda.scratch_words, _cuda_callable, **asked)
             boxes = functools.partial(call_kernels, tree_cuda.scratch_words, _tree_on_cuda, given=orders_for_tree, **asked)
             cuda = functools.partial(by_cells_or_tree, cells, boxes)
-            return lax.platform_dependent(search._replace(checks={}), cpu=tree, cuda=cuda)
+            return on_platform(search._replace(checks={}), late=True, cpu=tree, cuda=cuda)
 
         def on(module: ModuleType, make: Callable[[Variant], Any]) -> Callable[[Search], Rows]:
             blocks = few_cuda.blocks(search.sizes[1]) if module is few_cuda else None
@@ -90,7 +91,7 @@ class WarpEngine:
 
         few = are_few(search)
         cpu, cuda = on(cells_cpu, _cpu_callable), on(few_cuda, _few_callable) if few else on(cells_cuda, _cuda_callable)
-        return lax.platform_dependent(search._replace(checks={}), cpu=cpu, cuda=cuda)
+        return on_platform(search._replace(checks={}), cpu=cpu, cuda=cuda)
 
     def scratch_bytes(self, platform: str, n: int, m: int, dim: int, double: bool, own: bool, scaled: bool) -> int:
         """Return the scratch that the kernels are given [B]."""

@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 import jax.numpy as jnp
 import numpy as np
-from jax import Array, lax
+from jax import Array
 
 from jfrnn._engine.boxes_warp import box_sums
 from jfrnn._engine.launch import Call, Shapes, kernel
@@ -16,6 +16,7 @@ from jfrnn._engine.sum_results import FoundSums, SumsOf, TermText, beside_rows, 
 from jfrnn._engine.variants import SumVariant, names_of_particles, names_of_tree, size_numbers
 from jfrnn._engine.warp import QUERIES_PER_THREAD, are_few, by_cells_or_tree, fit_tree, place_launches, sort_on_cpu
 from jfrnn._geometry import Cutoffs
+from jfrnn._tracing import on_platform
 from jfrnn.kernels import cells_cpu, cells_cuda, few_cuda, pair_sum_cpu, pair_sum_cuda, tree_cpu, tree_cuda
 from jfrnn.kernels._native import EXCLUDED
 
@@ -60,7 +61,7 @@ def pair_sums(
         return call
 
     cuda = functools.partial(by_cells_or_tree, on(True), on(True, True)) if rule else on(True)
-    return lax.platform_dependent(search._replace(checks={}), values, cpu=on(False), cuda=cuda)
+    return on_platform(search._replace(checks={}), values, late=bool(rule), cpu=on(False), cuda=cuda)
 
 
 def _call_sums(

@@ -19,6 +19,7 @@ from jfrnn._geometry.exact import Shifted
 from jfrnn._geometry.far import is_far, move_near
 from jfrnn._geometry.floats import WHOLE_BITS, distill, half_mantissa
 from jfrnn._geometry.images import Images
+from jfrnn._tracing import on_platform
 
 
 @jax.tree_util.register_dataclass
@@ -280,7 +281,7 @@ def _look_whether_far(points: Array, lattice: Lattice) -> Near:
     """Bring points near behind a condition on a CPU, where that is worth it."""
     if lattice.images.counts_short:
         return Near(points, jnp.zeros_like(points))
-    return lax.platform_dependent(points, lattice, cpu=_bring_near_if_any_is_far, default=_bring_each_near)
+    return on_platform(points, lattice, cpu=_bring_near_if_any_is_far, default=_bring_each_near)
 
 
 def _bring_each_near(points: Array, lattice: Lattice, rarely: bool = False) -> Near:

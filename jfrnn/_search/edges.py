@@ -30,7 +30,7 @@ from jfrnn._search.geometry import ImagesMade, edge_shifts, find_ends, lattice_o
 from jfrnn._search.reverse import Reverse
 from jfrnn._search.topology import Topology
 from jfrnn._search.triplets import Triplets, triplets_of
-from jfrnn._tracing import call_apart, compile_program
+from jfrnn._tracing import call_apart, compile_program, on_platform
 
 
 class Edges(NamedTuple):
@@ -133,7 +133,7 @@ def flatten(mask: Array, total: int, native: bool = False) -> Flat:
     if native:
         offsets = row_offsets(jnp.sum(mask, axis=1, dtype=jnp.int32), capacity)
         on_cpu, on_cuda = (functools.partial(flatten_slots, total=total, cuda=cuda) for cuda in (False, True))
-        rows, slots = lax.platform_dependent(mask, offsets[:-1], cpu=on_cpu, cuda=on_cuda)
+        rows, slots = on_platform(mask, offsets[:-1], cpu=on_cpu, cuda=on_cuda)
         real, edge = lax.iota(jnp.int32, total) < offsets[-1], lax.iota(jnp.int32, total)
         at = jnp.where(real, slots, mask.size)
         edges = jnp.full(mask.size, total, jnp.int32).at[at].set(edge, mode="drop", unique_indices=True)

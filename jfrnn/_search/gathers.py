@@ -19,7 +19,17 @@ from jax.interpreters import ad, batching, mlir
 from jfrnn._engine import collect_slots
 from jfrnn._search.reverse import MOST_SLOTS
 from jfrnn._search.topology import Topology
-from jfrnn._tracing import Aval, Internal, Tree, compile_program, result_aval, unvarying_types, vary, varying_axes
+from jfrnn._tracing import (
+    Aval,
+    Internal,
+    Tree,
+    compile_program,
+    on_platform,
+    result_aval,
+    unvarying_types,
+    vary,
+    varying_axes,
+)
 
 Structure = Any  # a `PyTreeDef`, which type checkers do not accept as a type
 _WIDEST = 16  # numbers of a slot that kernels add
@@ -58,7 +68,7 @@ def _collect(y: Array, topology: Topology) -> Array:
     if topology.native and flat.dtype in (np.float32, np.float64) and 0 < flat[0].size <= _WIDEST:
         given = flat.reshape(len(flat), -1), reverse.slots, reverse.starts, reverse.lengths
         on_cpu, on_cuda = (functools.partial(collect_slots, sources=topology.sources, cuda=cuda) for cuda in (False, True))
-        sums = lax.platform_dependent(*given, cpu=on_cpu, cuda=on_cuda)
+        sums = on_platform(*given, cpu=on_cpu, cuda=on_cuda)
         return sums.reshape(topology.sources, *y.shape[2:])
     if reverse.starts is None or reverse.lengths is None:
         return jnp.sum(flat.at[reverse.slots].get(mode="fill", fill_value=0), axis=1)

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from jfrnn._engine import reverse_slots, slots_by_source
+from jfrnn._tracing import on_platform
 
 MOST_SLOTS = 2**31 - 1  # that int32 can number
 _BLOCK = 1 << 22  # ids that are compared at a time by array programming: 16 MB
@@ -52,11 +53,11 @@ def find_reverse(idx: Array, codes: Array | None, images: int, sources: int, mut
         if not native:
             return Reverse(arrays(idx, codes))
         on_cpu, on_cuda = (functools.partial(reverse_slots, images=images, cuda=cuda) for cuda in (False, True))
-        return Reverse(lax.platform_dependent(idx, codes, cpu=on_cpu, cuda=on_cuda))
+        return Reverse(on_platform(idx, codes, cpu=on_cpu, cuda=on_cuda))
     sort = functools.partial(_sort_slots, sources=sources)
     if not native:
         return Reverse(*sort(idx))
-    return Reverse(*lax.platform_dependent(idx, cpu=functools.partial(slots_by_source, sources=sources), cuda=sort))
+    return Reverse(*on_platform(idx, cpu=functools.partial(slots_by_source, sources=sources), cuda=sort))
 
 
 def _reverse_by_comparing(idx: Array, codes: Array | None, images: int) -> Array:

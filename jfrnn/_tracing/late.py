@@ -1,7 +1,7 @@
-"""Functions that are traced when a program is lowered, for the platform it is lowered for.
+"""What is done differently on each platform, and functions that are traced when a program is lowered, for the platform it is for.
 
-`lax.platform_dependent` traces one branch per platform, of which a compiled program contains one. Here the function is a parameter
-of a primitive, whose lowering knows the platform and traces the function once.
+`lax.platform_dependent` traces one branch per platform, of which a compiled program contains one. Where one takes long to trace,
+the function is a parameter of a primitive here, whose lowering knows the platform and traces the function once.
 """
 
 import contextlib
@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 
 import jax
 import numpy as np
-from jax import Array
+from jax import Array, lax
 from jax.core import ShapedArray
 
 from jfrnn._tracing.kinds import Aval, Internal, Tree
@@ -22,6 +22,26 @@ _platform: contextvars.ContextVar[str | None] = contextvars.ContextVar("platform
 def platform_of_lowering() -> str | None:
     """Return the one platform for which the function that is being traced will be lowered, or None if that is not known."""
     return _platform.get()
+
+
+def on_platform(
+    *args: Tree, late: bool = False, default: Callable[..., Tree] | None = None, **branches: Callable[..., Tree]
+) -> Tree:
+    """Call the function that `branches` has for the platform for which a program is compiled, else `default`.
+
+    Args:
+        args: What the function is given, pytrees of arrays.
+        late: Trace that function alone, while lowering; its results have the shapes of those of `cpu`, and no derivative.
+        default: For platforms that are not named.
+        branches: By names of platforms in JAX: cpu, cuda.
+    """
+    platform = platform_of_lowering()
+    branch = None if platform is None else branches.get(platform, default)
+    if branch is not None:
+        return branch(*args)
+    if late:
+        return call_late(functools.partial(on_platform, default=default, **branches), args, jax.eval_shape(branches["cpu"], *args))
+    return lax.platform_dependent(*args, default=default, **branches)
 
 
 def call_late(fn: Callable[..., Tree], args: tuple, like: Tree) -> Tree:

@@ -9,10 +9,11 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jax import Array, lax
+from jax import Array
 
 from jfrnn._engine import Call, Clear, Launch, Plan, Shapes, ask_for_huge_pages, kernel, share
 from jfrnn._geometry import Cutoff
+from jfrnn._tracing import on_platform
 from jfrnn._triangles.cells import LANES, MOST_CELLS, TriangleCells, bucket_count, entry_count, level_limit
 from jfrnn._triangles.cells import sort_triangles as sort_by_jax
 from jfrnn._triangles.rows import decide_pairs as decide_by_jax
@@ -47,7 +48,7 @@ def sort_triangles(corners: Array, good: Array, cutoff: Cutoff) -> TriangleCells
         start, triangles, levels, level_count, level_of, _ = call(corners, good.astype(jnp.int32), radius, output_dims=sizes)
         return TriangleCells(start, triangles, levels, level_count[0], level_of)
 
-    return lax.platform_dependent(corners, good, cutoff, cpu=build, cuda=sort_by_jax)
+    return on_platform(corners, good, cutoff, cpu=build, cuda=sort_by_jax)
 
 
 def list_triangles(
@@ -57,7 +58,7 @@ def list_triangles(
     tree = isinstance(cells, TriangleTree)
     variant = _Variant(positions.shape[1], positions.dtype == jnp.float64, capacity is not None, tree)
     on_cpu, on_cuda = (functools.partial(call, variant, capacity or 0) for call in (_query_on_cpu, _query_on_cuda))
-    return lax.platform_dependent(*query_inputs(positions, corners, cells, cutoff), cpu=on_cpu, cuda=on_cuda)
+    return on_platform(*query_inputs(positions, corners, cells, cutoff), cpu=on_cpu, cuda=on_cuda)
 
 
 def query_inputs(positions: Array, corners: Array, cells: TriangleCells | TriangleTree, cutoff: Cutoff) -> tuple[Array, ...]:
@@ -158,7 +159,7 @@ def cast_rays(
         return of(points.shape[1], bool(points.dtype == jnp.float64))(*given, output_dims={"side": len(points), "info": 1})[0]
 
     on_cpu, on_cuda = (functools.partial(call, of) for of in (_rays_on_cpu, _rays_on_cuda))
-    side = lax.platform_dependent(*inputs, cpu=on_cpu, cuda=on_cuda)
+    side = on_platform(*inputs, cpu=on_cpu, cuda=on_cuda)
     return side == 1, side == 2
 
 
@@ -167,17 +168,14 @@ def decide_pairs(own: Array, corners: Array, particle: Array, triangle: Array, c
 
     On the CPU by a kernel, whose integers XLA would compile anew, for seconds, wherever pairs are decided.
     """
-    radius = jnp.reshape(jnp.asarray(cutoff.radius), 1)
 
-    def on_cpu(own: Array, corners: Array, particle: Array, triangle: Array, asked: Array) -> Array:
+    def on_cpu(own: Array, corners: Array, particle: Array, triangle: Array, cutoff: Cutoff, asked: Array) -> Array:
+        radius = jnp.reshape(jnp.asarray(cutoff.radius), 1)
         call = _pairs_on_cpu(own.shape[1], bool(own.dtype == jnp.float64))
         sizes = {"near": len(particle), "info": 1}
         return call(own, corners, radius, particle, triangle, asked.astype(jnp.int32), output_dims=sizes)[0] > 0
 
-    def elsewhere(own: Array, corners: Array, particle: Array, triangle: Array, asked: Array) -> Array:
-        return decide_by_jax(own, corners, particle, triangle, cutoff, asked)
-
-    return lax.platform_dependent(own, corners, particle, triangle, asked, cpu=on_cpu, default=elsewhere)
+    return on_platform(own, corners, particle, triangle, cutoff, asked, late=True, cpu=on_cpu, default=decide_by_jax)
 
 
 @kernel

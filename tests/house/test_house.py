@@ -2,6 +2,7 @@
 
 import ast
 import doctest
+import functools
 import importlib
 import inspect
 import re
@@ -79,18 +80,21 @@ def modules_below(folder, name):
     return {".".join((name, *(part for part in parts if part != "__init__"))): path for parts, path in named.items()}
 
 
+@functools.cache
 def taken_from(path):
-    """Yield what a file imports: a dotted module and a name of it, or None."""
+    """Return what a file imports: pairs of a dotted module and a name of it, or None."""
+    taken = []
     tree = ast.parse(path.read_text())
     if path == ROOT / "jfrnn" / "__init__.py":  # its modules, which it names for who checks types alone
         tree.body = [node for node in tree.body if not (isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING")]
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
-            yield from ((alias.name, None) for alias in node.names)
+            taken += [(alias.name, None) for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
             above = [".".join(package_of(path).split(".")[: 1 - node.level or None])] if node.level else []
             module = ".".join([*above, *([node.module] if node.module else [])])
-            yield from ((module, alias.name) for alias in node.names)
+            taken += [(module, alias.name) for alias in node.names]
+    return taken
 
 
 def package_of(path):

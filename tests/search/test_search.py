@@ -287,7 +287,8 @@ def test_memory_of_scratch_stays_within_the_stated_bound(n, capacity, dtype, dim
     x = jax.ShapeDtypeStruct((n, dim), dtype)
     call = functools.partial(jfrnn.search, capacity=capacity) if capacity else jfrnn.count
     memory = jax.jit(lambda x: call(x, 0.1, backend="jax")).lower(x).compile().memory_analysis()
-    assert memory.temp_size_in_bytes <= 64e6 + (100 if dtype == np.float32 else 125) * n
+    candidates = 64e6 if jax.default_backend() == "cpu" else 1e9
+    assert memory.temp_size_in_bytes <= candidates + (100 if dtype == np.float32 else 125) * n
 
 
 @pytest.mark.parametrize("backend", [pytest.param("jax", marks=SLOW), "warp"])
