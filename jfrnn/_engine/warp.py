@@ -50,6 +50,7 @@ QUERIES_PER_THREAD = 1024  # on the CPU, at least: among 1000, to wake a second 
 # each that is near, before a tree is searched; and how many queries and sources tell. The first two were measured on an H200 for a
 # walker that trees have replaced, and that was slower: where a tree begins to be faster has not been measured.
 MOST_MET, MOST_MORE, SAMPLED = 2000, 8, (1024, 4096)
+Given = Callable[[Search], dict[str, Array]]  # makes what kernels are given besides, by its names
 Found = TypeVar("Found")  # what a search or a sum returns
 
 
@@ -75,12 +76,7 @@ class WarpEngine:
         if search.per_system:
             return box_neighbors(search._replace(checks={}), options.filter, capacity)
         if isinstance(search.cutoff, Cutoffs):
-            asked = {"keep": options.filter, "capacity": capacity}
-            tree = functools.partial(call_kernels, tree_cpu.scratch_words, _tree_callable, **asked)
-            cells = functools.partial(call_kernels, cells_cuda.scratch_words, _cuda_callable, **asked)
-            boxes = functools.partial(call_kernels, tree_cuda.scratch_words, _tree_on_cuda, given=orders_for_tree, **asked)
-            cuda = functools.partial(by_cells_or_tree, cells, boxes)
-            return on_platform(search._replace(checks={}), late=True, cpu=tree, cuda=cuda)
+            return self._rows_of_cutoffs(search._replace(checks={}), options.filter, capacity)
 
         def on(module: ModuleType, make: Callable[[Variant], Any]) -> Callable[[Search], Rows]:
             blocks = few_cuda.blocks(search.sizes[1]) if module is few_cuda else None
@@ -92,6 +88,19 @@ class WarpEngine:
         few = are_few(search)
         cpu, cuda = on(cells_cpu, _cpu_callable), on(few_cuda, _few_callable) if few else on(cells_cuda, _cuda_callable)
         return on_platform(search._replace(checks={}), cpu=cpu, cuda=cuda)
+
+    def _rows_of_cutoffs(self, search: Search, keep: Filter, capacity: int | Room | None) -> Rows:
+        starts = (capacity.starts,) if isinstance(capacity, Room) else ()
+
+        def by(make: Callable[[Variant], Any], module: ModuleType, given: Given | None = None) -> Callable[..., Rows]:
+            def call(search: Search, *starts: Array) -> Rows:
+                room = capacity._replace(starts=starts[0]) if isinstance(capacity, Room) else capacity
+                return call_kernels(module.scratch_words, make, search, keep=keep, capacity=room, given=given)
+
+            return call
+
+        cuda = functools.partial(by_cells_or_tree, by(_cuda_callable, cells_cuda), by(_tree_on_cuda, tree_cuda, orders_for_tree))
+        return on_platform(search, *starts, late=True, cpu=by(_tree_callable, tree_cpu), cuda=cuda)
 
     def scratch_bytes(self, platform: str, n: int, m: int, dim: int, double: bool, own: bool, scaled: bool) -> int:
         """Return the scratch that the kernels are given [B]."""
@@ -193,7 +202,7 @@ def call_kernels(
     capacity: int | Room | None,
     blocks: int | None = None,
     order: Callable[[Array], Array] | None = None,
-    given: Callable[[Search], dict[str, Array]] | None = None,
+    given: Given | None = None,
 ) -> Rows:
     """Let XLA call what `make` returns, with the scratch that its kernels ask for.
 

@@ -256,10 +256,21 @@ struct Search : SearchArguments, Cells, Thread, Shares, Scratch {
             const bool finite = finite_point(p);
             const int cell = finite ? cell_key(grid, p, system_of(points + ROW * i)) : -1;
             key[i] = cell;
-            slot[i] = atomicAdd(finite ? counts + cell : &shared.behind[of_queries], 1);
-            if (!finite && of_queries)
+            slot[i] = finite ? atomicAdd(counts + cell, 1) : place_behind();
+        }
+    }
+
+    // Returns a place behind all cells, each time another one: lanes of a warp ask for theirs at once.
+    JFRNN_MEMBER int place_behind() const {
+        const unsigned int asking = __activemask();
+        const int first = __ffs((int)asking) - 1;
+        int from = 0;
+        if (lane == first) {
+            from = atomicAdd(&shared.behind[of_queries], __popc(asking));
+            if (of_queries)
                 atomicOr(&info[1], 2);
         }
+        return __shfl_sync(asking, from, first) + __popc(asking & ((1u << lane) - 1));
     }
 
     // Turns counts into first places; one more entry is the end of the last cell.

@@ -71,7 +71,7 @@ struct Sums : Walk<Sums> {
             take(held, some);
             evaluate(term, own_part, others, reduction);
         }
-        reduction.store(results, {lane, group.my_id, group.place >> share_bits, lane < group.size, pairs.fresh, finished});
+        reduction.store(results, {lane, group.my_id, served, lane < group.size, pairs.fresh, finished});
     }
     // Takes the next pairs of a block, and loads what is read of them.
     JFRNN_MEMBER void take(HeldPairs& held, Taken& taken) {

@@ -13,6 +13,8 @@
 
 template <class Query>
 struct Walk : PairSearch {
+    int served;  // the block of queries that is served
+
     JFRNN_MEMBER explicit Walk(const SearchArguments& given) : PairSearch(given) {}
     JFRNN_MEMBER Query& query() { return *static_cast<Query*>(this); }
 
@@ -29,13 +31,21 @@ struct Walk : PairSearch {
         else
             serve(block);
     }
-    // Serves the queries of a block, group by group.
+    // Serves the queries of a block. Those with the largest cutoffs of all, which come first in a tree, may lie far from each other and
+    // have many candidates each: no block serves two of them.
     JFRNN_MEMBER void serve(int block) {
-        const long long begin = (long long)block << share_bits;
-        int place = begin < m ? (int)begin : m;
-        const int share = 1 << share_bits, stop = m - place < share ? m : place + share;
-        bool loose = false;  // of a tree: whether queries of this block have been far from each other
+        constexpr int MOST_APART = TREE ? 32 : 0;
+        const int share = 1 << share_bits, apart = query_blocks < MOST_APART ? query_blocks : MOST_APART;
+        const long long begin = (long long)block << share_bits, end = begin + share;
+        served = block;
         query().open(block);
+        if (block < apart)
+            serve_queries(block, block + 1);
+        serve_queries(begin < apart ? apart : begin < m ? (int)begin : m, end < m ? (int)end : m);
+    }
+    // Serves the queries from a place on, group by group.
+    JFRNN_MEMBER void serve_queries(int place, int stop) {
+        bool loose = false;  // of a tree: whether some have been far from each other
         while (place < stop) {
             Group group(*this, place, stop);
             if (group.size == 0) {
