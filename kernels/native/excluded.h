@@ -7,7 +7,7 @@
 // 2, an id names an image of a source: source + n * code. Of short rows a filter has a bit for each number modulo 64 that stands there:
 // it tells most other sources apart without a look at the row.
 struct Excluded {
-    static constexpr int SHORT = 64;
+    static constexpr int SHORT = 64, MOST_KEPT = 4, NOBODY = -1, MANY = -2;
     // The id of a source, of which there are n, in an image.
     JFRNN_FUNCTION int id_of(int source, int code, int n) { return EXCLUDING == 2 ? source + n * code : source; }
     const int *begin, *end;
@@ -19,6 +19,11 @@ struct Excluded {
         for (const int* id = begin; is_short && id < end; ++id)
             filter |= 1ull << (*id & 63);
         filter = is_short ? filter : ~0ull;
+    }
+    // Writes down the row where it holds at most MOST_KEPT ids, else MANY.
+    JFRNN_INLINE void keep(int* ids) const {
+        for (int k = 0; k < MOST_KEPT; ++k)
+            ids[k] = end - begin > MOST_KEPT ? MANY : begin + k < end ? begin[k] : NOBODY;
     }
     // May a source stand in a row with a filter?
     JFRNN_FUNCTION bool may_stand(unsigned long long filter, int source) { return filter >> (source & 63) & 1; }

@@ -111,10 +111,15 @@ JFRNN_FUNCTION unsigned int drop_excluded(const PairSearch& search, const Group&
     }
     if (doubtful == 0)
         return hits;
-    const Excluded mine(search.excluded_starts, search.excluded, group.my_id, filter);
+    const int* const kept = shared_warp().excluded[search.lane];
+    const bool are_many = kept[0] == Excluded::MANY;
     for (; doubtful; doubtful &= doubtful - 1) {
-        const int j = __ffs(doubtful) - 1;
-        hits &= mine.has(search.excluded_id(ids[j])) ? ~(1u << j) : ALL;
+        const int j = __ffs(doubtful) - 1, id = search.excluded_id(ids[j]);
+        bool found = are_many && Excluded(search.excluded_starts, search.excluded, group.my_id, filter).has(id);
+#pragma unroll
+        for (int k = 0; k < Excluded::MOST_KEPT; ++k)
+            found |= kept[k] == id;
+        hits &= found ? ~(1u << j) : ALL;
     }
     return hits;
 }

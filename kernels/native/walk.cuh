@@ -65,8 +65,11 @@ struct Walk : PairSearch {
             this->take_cutoffs(group.my_id, lane < group.size);
         group.enclose(*this);
         Runs runs(*this, group, loose);
-        if constexpr (EXCLUDING)
-            shared_warp().filters[lane] = Excluded(excluded_starts, excluded, lane < group.size ? group.my_id : 0).filter;
+        if constexpr (EXCLUDING) {
+            const Excluded mine(excluded_starts, excluded, lane < group.size ? group.my_id : 0);
+            shared_warp().filters[lane] = mine.filter;
+            mine.keep(shared_warp().excluded[lane]);
+        }
         Pairs pairs{0, 0, 0, 0, own && drop_self, true};
         if constexpr (LIST)
             shared_warp().written[lane] = 0;
