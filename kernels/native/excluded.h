@@ -20,6 +20,12 @@ struct Excluded {
             filter |= 1ull << (*id & 63);
         filter = is_short ? filter : ~0ull;
     }
+    // Which ids stand in any of several rows, as far as their last digits tell.
+    struct OfAny {
+        static constexpr int WORDS = EXCLUDING ? 64 : 1;
+        unsigned int bits[WORDS];
+        JFRNN_INLINE bool may_have(int id) const { return bits[id >> 5 & (WORDS - 1)] >> (id & 31) & 1; }
+    };
     // Writes down the row where it holds at most MOST_KEPT ids, else MANY.
     JFRNN_INLINE void keep(int* ids) const {
         for (int k = 0; k < MOST_KEPT; ++k)

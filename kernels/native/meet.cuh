@@ -101,21 +101,18 @@ JFRNN_FUNCTION unsigned int find_met(const PairSearch& search, const Group& grou
     }
     return met;
 }
-// Returns which of the neighbors in a block of candidates a query does not exclude.
-JFRNN_FUNCTION unsigned int drop_excluded(const PairSearch& search, const Group& group, const int* ids, unsigned int hits) {
-    const unsigned long long filter = shared_warp().filters[search.lane];
-    unsigned int doubtful = 0;
-    for (unsigned int rest = filter ? hits : 0; rest; rest &= rest - 1) {
-        const int j = __ffs(rest) - 1;
-        doubtful |= Excluded::may_stand(filter, search.excluded_id(ids[j])) ? 1u << j : 0;
-    }
-    if (doubtful == 0)
-        return hits;
-    const int* const kept = shared_warp().excluded[search.lane];
-    const bool are_many = kept[0] == Excluded::MANY;
-    for (; doubtful; doubtful &= doubtful - 1) {
-        const int j = __ffs(doubtful) - 1, id = search.excluded_id(ids[j]);
-        bool found = are_many && Excluded(search.excluded_starts, search.excluded, group.my_id, filter).has(id);
+// Returns which of the neighbors in a block of so many candidates a query does not exclude. Few candidates stand in the row of any query
+// of the group: the others are told apart by one lane each.
+JFRNN_FUNCTION unsigned int drop_excluded(
+    const PairSearch& search, const Group& group, const int* ids, int size, unsigned int hits) {
+    const Warp& warp = shared_warp();
+    const int lane = search.lane;
+    const bool by_any = lane < size && warp.excluded_by_any.may_have(search.excluded_id(ids[lane]));
+    const int* const kept = warp.excluded[lane];
+    for (unsigned int rest = hits & __ballot_sync(ALL, by_any); rest; rest &= rest - 1) {
+        const int j = __ffs(rest) - 1, id = search.excluded_id(ids[j]);
+        bool found =
+            kept[0] == Excluded::MANY && Excluded(search.excluded_starts, search.excluded, group.my_id, warp.filters[lane]).has(id);
 #pragma unroll
         for (int k = 0; k < Excluded::MOST_KEPT; ++k)
             found |= kept[k] == id;
@@ -181,7 +178,8 @@ JFRNN_FUNCTION void meet_block(
         aside.take_back(candidates, matrix);
     }
     if constexpr (EXCLUDING)
-        hits = drop_excluded(search, group, HELD ? warp.ids + pairs.tested : warp.candidate_ids + first_candidate, hits);
+        hits = drop_excluded(
+            search, group, HELD ? warp.ids + pairs.tested : warp.candidate_ids + first_candidate, pairs.kept - pairs.tested, hits);
     pairs.found += __popc(hits);
     if constexpr (HELD) {
         warp.hits[pairs.tested / 32][search.lane] = hits;

@@ -39,9 +39,13 @@ struct Walk : PairSearch {
         const long long begin = (long long)block << share_bits, end = begin + share;
         served = block;
         query().open(block);
-        if (block < apart)
-            serve_queries(block, block + 1);
-        serve_queries(begin < apart ? apart : begin < m ? (int)begin : m, end < m ? (int)end : m);
+#pragma unroll 1
+        for (bool alone = block < apart;; alone = false) {
+            const int place = alone ? block : begin < apart ? apart : begin < m ? (int)begin : m;
+            serve_queries(place, alone ? block + 1 : end < m ? (int)end : m);
+            if (!alone)
+                break;
+        }
     }
     // Serves the queries from a place on, group by group.
     JFRNN_MEMBER void serve_queries(int place, int stop) {
@@ -65,11 +69,8 @@ struct Walk : PairSearch {
             this->take_cutoffs(group.my_id, lane < group.size);
         group.enclose(*this);
         Runs runs(*this, group, loose);
-        if constexpr (EXCLUDING) {
-            const Excluded mine(excluded_starts, excluded, lane < group.size ? group.my_id : 0);
-            shared_warp().filters[lane] = mine.filter;
-            mine.keep(shared_warp().excluded[lane]);
-        }
+        if constexpr (EXCLUDING)
+            keep_excluded(group);
         Pairs pairs{0, 0, 0, 0, own && drop_self, true};
         if constexpr (LIST)
             shared_warp().written[lane] = 0;
@@ -104,6 +105,21 @@ struct Walk : PairSearch {
                 }
         }
         query().done(group, pairs.found);
+    }
+    // Keeps what the queries exclude.
+    JFRNN_MEMBER void keep_excluded(const Group& group) {
+        Warp& warp = shared_warp();
+        const Excluded mine(excluded_starts, excluded, lane < group.size ? group.my_id : 0);
+        warp.filters[lane] = mine.filter;
+        mine.keep(warp.excluded[lane]);
+        unsigned int* const words = warp.excluded_by_any.bits;
+        for (int w = lane; w < Excluded::OfAny::WORDS; w += 32)
+            words[w] = __any_sync(ALL, mine.end - mine.begin > Excluded::SHORT) ? ALL : 0;
+        __syncwarp();
+        const bool is_short = lane < group.size && mine.end - mine.begin <= Excluded::SHORT;
+        for (const int* id = mine.begin; is_short && id < mine.end; ++id)
+            atomicOr(words + (*id >> 5 & (Excluded::OfAny::WORDS - 1)), 1u << (*id & 31));
+        __syncwarp();
     }
     // Makes rows of a matrix of the queries and, if they are sources, keeps them as the first candidates: the number is the lane.
     JFRNN_MEMBER void keep_queries(const Group& group, Matrix& matrix, Pairs& pairs) {

@@ -32,7 +32,8 @@ struct alignas(16) Warp {
     unsigned int hits[HELD ? BLOCKS + 1 : 1][32];  // per block of candidates and query: one bit per candidate
     unsigned int written[LIST ? 32 : 1];  // per query: neighbors that stand in its row, a multiple of four, plus those left over
     int left[LIST ? 3 : 1][32];           // the ids of those left over
-    unsigned long long filters[EXCLUDING ? 32 : 1];         // of the rows that queries exclude (excluded.h)
+    unsigned long long filters[EXCLUDING ? 32 : 1];  // of the rows that queries exclude (excluded.h)
+    Excluded::OfAny excluded_by_any;
     int excluded[EXCLUDING ? 32 : 1][Excluded::MOST_KEPT];  // what stands in them, where that is little
     Box box;
     Run runs[33];
