@@ -173,7 +173,22 @@ struct Scan : SearchArguments, SystemCells, SourcePlaces {
     int source_at(int number) const { return NAMED ? candidate_ids[number] % n : candidate_ids[number]; }
     // Those of the candidates from number b on, of which some are `near`, that a query does not exclude.
     unsigned int wanted(const Excluded& excluded, int b, unsigned int near) const {
-        for (unsigned int rest = excluded.begin < excluded.end ? near : 0; rest; rest &= rest - 1) {
+        const int many = (int)(excluded.end - excluded.begin);
+        unsigned int rest = many > 0 ? near : 0;
+        if constexpr (EXCLUDING == 1 && !NAMED) {  // all at once: a short row, or what the filter tells of a longer one
+            const ints ids = *(const ints*)(candidate_ids + b);
+            if (many <= Excluded::MOST_KEPT) {
+                ints found{};
+                for (int k = 0; k < many; ++k)
+                    found |= ids == excluded.begin[k];
+                return near & ~bits_of_flags(__builtin_convertvector(found, flags));
+            }
+            const ints low = ints{} + (int)(unsigned int)excluded.filter,
+                       high = ints{} + (int)(unsigned int)(excluded.filter >> 32);
+            const ints words = (ids & 32) != 0 ? high : low;
+            rest &= bits_of_flags(__builtin_convertvector((words >> (ids & 31) & 1) != 0, flags));
+        }
+        for (; rest; rest &= rest - 1) {
             const int lane = __builtin_ctz(rest);
             const int source = source_at(b + lane), code = PERIODIC && several ? candidate_images[b + lane] : image;
             near &= excluded.has(Excluded::id_of(source, code, n)) ? ~(1u << lane) : ~0u;
