@@ -32,7 +32,7 @@ def _bytes_per_particle(method: str) -> Callable[[], str]:
 
 def _decided() -> str:
     """Return how many hard cases were decided on a GPU after later changes of kernels, if none was wrong."""
-    rows = [row for row in read("house/h200_exactness.jsonl") if row["kind"] == "exactness"]
+    rows = [row for row in read("h200/decided_again.jsonl") if row["kind"] == "exactness"]
     wrong = sum(row["wrong"] for row in rows)
     return f"{whole(sum(row['cases'] for row in rows))} decisions, {wrong or 'none'} wrong"
 
