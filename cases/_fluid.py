@@ -216,11 +216,14 @@ class Solid:
         faces: Vertices of each triangle, counterclockwise as seen from the fluid, integers, shape [f, d]; in 2D segments,
             counterclockwise around what holds no fluid.
         turning: How it turns; None: it stays.
+        thin: Whether particles on two sides of it must not feel each other through it, which each step then sees to; None: where
+            faces that look away from each other are nearer than the kernel reaches.
     """
 
     vertices: NDArray[np.float64]
     faces: NDArray[np.int32]
     turning: Turning[float, Floats] | None = None
+    thin: bool | None = None
 
 
 def inflow(

@@ -161,8 +161,10 @@ def _greatest(vectors: Array) -> Array:
     return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 0)
 
 
-def list_neighbors(model: Model, s: State, skin: float, slack: float) -> jfrnn.NeighborList:
-    """Return a neighbor list with a skin [m], and slots for `slack` times the longest row."""
+def list_neighbors(model: Model, s: State, skin: float, slack: float) -> jfrnn.NeighborList | None:
+    """Return a neighbor list with a skin [m], and slots for `slack` times the longest row; None beside a thin solid."""
+    if s.solid is not None and s.solid.sight is not None:  # which pairs it parts, changes in every step
+        return None
     return jfrnn.search(s.x, model.cutoff, box=model.box, active=active(model, s), skin=skin, slack=slack)
 
 

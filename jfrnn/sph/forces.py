@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from jfrnn.sph import correction, density, solids, states, surface, transport, viscosity, walls
+from jfrnn.sph.errors import SceneError
 from jfrnn.sph.kernels import KERNELS
 from jfrnn.sph.pairs import Neighbors, Pair, Term, Values, total
 from jfrnn.sph.particles import Model, State, active, own_acceleration
@@ -46,12 +47,18 @@ def _sum(term: Term, model: Model, s: State, values: Values, nbrs: Neighbors, of
     Where a scene's walls stand behind its fluid, rows that nobody reads are not summed: walls are most of a shallow tank. A
     particle of the fluid then meets itself at r = 0, where terms of the fluid are 0.
     """
-    options = {"box": model.box, "backend": model.backend}
+    options: dict[str, Any] = {"box": model.box, "backend": model.backend}
     if "rho" in values:  # per particle: a division per pair takes as long as the rest of a term
         values = values | {"specific": 1 / values["rho"], "volume": model.m / values["rho"]}
     values = values | {"m": model.m} | ({} if model.wall is None else {"wall": model.wall})
     entered, k = active(model, s), model.fluid_count
-    if k is None or nbrs is not None or of == "all":
+    if s.solid is not None and s.solid.sight is not None:
+        if nbrs is not None:
+            raise SceneError(
+                "nbrs must be None beside a thin solid: which pairs it parts changes in every step, and a list keeps them."
+            )
+        options["exclude"] = s.solid.sight.parted
+    if k is None or nbrs is not None or of == "all" or "exclude" in options:
         return total(term, s.x, values, model.kernel, model.physics.smoothing, nbrs, active=entered, **options)
     rows, sources = (slice(0, k), slice(None)) if of == "fluid" else (slice(k, None), slice(0, k))
     mine, theirs = ({key: value[part] for key, value in values.items()} for part in (rows, sources))
