@@ -11,7 +11,7 @@ from jfrnn.sph.errors import SceneError
 from jfrnn.sph.kernels import KERNELS
 from jfrnn.sph.pairs import Neighbors, Pair, Term, Values, total
 from jfrnn.sph.particles import Model, State, active, own_acceleration
-from jfrnn.sph.pressure import PRESSURES
+from jfrnn.sph.pressure import PRESSURES, less_mean
 
 _FEW = 0.5  # of what an evenly filled surrounding sums to
 
@@ -189,8 +189,7 @@ def accelerations(model: Model, s: State, seen: Fields, nbrs: Neighbors) -> tupl
 
     def term(pair: Pair, i: Values, j: Values) -> dict[str, Array]:
         gradient = _gradient(model, pair, i)
-        lifted = [of | {"p": of["p"] - i["mean"]} if "mean" in i else of for of in (i, j)]
-        along = PRESSURES[physics.pressure](pair, *lifted)
+        along = PRESSURES[physics.pressure](pair, *(less_mean(i, j) if "mean" in i else (i, j)))
         if physics.artificial is not None:
             along = along + viscosity.artificial(pair, i, j, physics.artificial * physics.sound_speed)
         a = along * gradient
