@@ -30,7 +30,7 @@ class Physics(Generic[Number, Vector]):
         exponent: γ of "tait".
         pressure: Form of the pressure force: "symmetric", "mean", "volume", "difference"; "source" is that of the 2D source.
         viscosity: Kinematic viscosity ν [m²/s] of laminar viscosity; with "source" the dynamic one, μ.
-        viscosity_form: "morris", "volume", or "source", that of the 2D source.
+        viscosity_form: "morris", "volume", "fourth" (of fourth order in h, with shorter steps), or "source", that of the 2D source.
         artificial: Monaghan's α of artificial viscosity.
         density_diffusion: δ of δ-SPH, about 0.1.
         pressure_diffusion: ν of EDAC [m²/s]: what smooths a carried pressure.
@@ -58,7 +58,7 @@ class Physics(Generic[Number, Vector]):
     exponent: float = 7.0
     pressure: Literal["symmetric", "mean", "volume", "difference", "source"] = "symmetric"
     viscosity: Number | None = None
-    viscosity_form: Literal["morris", "volume", "source"] = "morris"
+    viscosity_form: Literal["morris", "volume", "fourth", "source"] = "morris"
     artificial: Number | None = None
     density_diffusion: Number | None = None
     pressure_diffusion: Number | None = None
@@ -216,11 +216,14 @@ class Solid:
         faces: Vertices of each triangle, counterclockwise as seen from the fluid, integers, shape [f, d]; in 2D segments,
             counterclockwise around what holds no fluid.
         turning: How it turns; None: it stays.
+        thin: Whether particles on two sides of it must not feel each other through it, which each step then sees to; None: where
+            faces that look away from each other are nearer than the kernel reaches.
     """
 
     vertices: NDArray[np.float64]
     faces: NDArray[np.int32]
     turning: Turning[float, Floats] | None = None
+    thin: bool | None = None
 
 
 def inflow(

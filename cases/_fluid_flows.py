@@ -50,6 +50,7 @@ def taylor_green(
     sound_speed: float = 10.0,
     jitter: float = 0.1,
     seed: int = 0,
+    transport: float | None = None,
 ) -> FluidScene:
     """Return decaying vortices on the periodic unit square or cube, speed 1 m/s at first.
 
@@ -63,12 +64,18 @@ def taylor_green(
         sound_speed: c [m/s].
         jitter: Largest displacement of a particle from its site, in spacings: an exact lattice would keep its lines too long.
         seed: Of the displacements.
+        transport: Background pressure [Pa], ρ0c² as published, of a transport velocity that keeps particles evenly spread, with
+            volume forms of pressure and viscosity; None: particles are shifted, gradients corrected.
 
     Source: Taylor & Green (1937), doi:10.1098/rspa.1937.0036.
     """
     spacing = 1 / nx
     sites = lattice((0.0,) * dim, (nx,) * dim, spacing)
     positions = sites + jitter * spacing * np.random.default_rng(seed).uniform(-1, 1, sites.shape)
+    physics = replace(confined(spacing, 1.0, sound_speed, 1 / reynolds), viscosity_form="fourth")
+    if transport is not None:
+        forms = {"pressure": "volume", "viscosity_form": "volume", "shifting": None, "corrected": False}
+        physics = replace(physics, transport=transport, **forms)  # pyright: ignore[reportArgumentType]
     return FluidScene(
         name="taylor-green",
         positions=positions,
@@ -76,8 +83,8 @@ def taylor_green(
         masses=np.full(len(positions), spacing**dim),
         spacing=spacing,
         duration=duration,
-        step=courant(spacing, 1.0, sound_speed, 1 / reynolds),
-        physics=confined(spacing, 1.0, sound_speed, 1 / reynolds),
+        step=courant(spacing, 1.0, sound_speed, (1 if transport else 2) / reynolds),  # "fourth" takes half the step
+        physics=physics,
         periodic=Periodic((0.0,) * dim, (1.0,) * dim, (True,) * dim),
         bounds=Tank((0.0,) * dim, (1.0,) * dim),
         pressures=-0.25 * np.cos(4 * np.pi * positions).sum(axis=1) if dim == 2 else None,

@@ -259,6 +259,26 @@ def _crossing(ray: Sequence[int], shape: Sequence[Sequence[int]]) -> int | None:
     return 0 if one_way and other_way else None
 
 
+def is_parted(point: Any, end: Any, corners: Any) -> bool:
+    """Say whether the segment between two points meets the closed triangle, in 2D segment, between corners, at one point: exactly.
+
+    The point at which it meets the plane is a rational number, and so are its shares of the corners: Cramer's rule.
+    """
+    start, end, *shape = ([Fraction(float(x)) for x in row] for row in (point, end, *corners))
+    along, base = _minus(end, start), shape[-1]
+    columns = [*(_minus(corner, base) for corner in shape[:-1]), [-x for x in along]]
+    rows, right = [list(row) for row in zip(*columns, strict=True)], _minus(start, base)
+    whole = _determinant(rows)
+    if whole == 0:
+        return False
+    parts = [
+        _determinant([[right[k] if c == which else x for c, x in enumerate(row)] for k, row in enumerate(rows)])
+        for which in range(len(rows))
+    ]
+    *shares, place = [part / whole for part in parts]
+    return all(share >= 0 for share in shares) and sum(shares) <= 1 and 0 <= place <= 1
+
+
 def _determinant(rows: Sequence[Sequence[int]]) -> int:
     if len(rows) == 2:
         return rows[0][0] * rows[1][1] - rows[0][1] * rows[1][0]

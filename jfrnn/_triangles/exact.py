@@ -16,6 +16,7 @@ another; `steady` prevents that.
 """
 
 from collections.abc import Callable
+from typing import TypeVar
 
 import jax.numpy as jnp
 import numpy as np
@@ -23,9 +24,10 @@ from jax import Array, lax
 
 from jfrnn._geometry import Cutoff, limb_bits
 from jfrnn._tracing import first_set, set_places
-from jfrnn._triangles.integers import Shapes, bit_range, is_near, limb_counts
+from jfrnn._triangles.integers import Segments, Shapes, bit_range, is_near, limb_counts
 
 ShapesAt = Callable[[Array], Shapes]
+Asked = TypeVar("Asked", Shapes, Segments)
 Vector = list[Array]
 
 _USUAL, _WIDE = 2, 3  # open pairs: undecided yet, and too wide for the usual number of limbs
@@ -39,7 +41,7 @@ def is_near_of(points: Vector, corners: list[Vector], cutoff: Cutoff, shapes_at:
     `shapes_at` returns the pairs at indices [k]; `zero` [q] is that of `steady`.
     """
     surely, open_pairs = sure_pairs(points, corners, cutoff, zero)
-    return (surely & asked) | _refine(open_pairs & asked, shapes_at)
+    return (surely & asked) | refine(open_pairs & asked, shapes_at, is_near)
 
 
 def sure_pairs(points: Vector, corners: list[Vector], cutoff: Cutoff, zero: Array) -> tuple[Array, Array]:
@@ -145,20 +147,28 @@ def _combine(weights: Vector, x: list[Vector], zero: Array | None = None) -> Vec
     return [dot(weights, [corner[k] for corner in x], zero) for k in range(len(x[0]))]
 
 
-def _refine(open_pairs: Array, shapes_at: ShapesAt) -> Array:
-    """Decide the pairs that step 1 left open, a few at a time; False elsewhere. Does nothing if no pair is open."""
+def refine(open_pairs: Array, asked_at: Callable[[Array], Asked], test: Callable[[Asked, Array, int], Array]) -> Array:
+    """Decide the pairs that floats left open, a few at a time; False elsewhere. Does nothing if no pair is open.
+
+    Args:
+        open_pairs: Shape [q], bool.
+        asked_at: Returns what is asked of the pairs at indices [k].
+        test: Decides it in integers, as `is_near`.
+    """
 
     def decide(open_pairs: Array) -> Array:
         state = jnp.where(open_pairs, _USUAL, 0).astype(jnp.int32)
         for waiting, chunk in ((_USUAL, _USUAL_CHUNK), (_WIDE, _WIDE_CHUNK)):
-            state = _decide(state, waiting, min(chunk, state.size), shapes_at)
+            state = _decide(state, waiting, min(chunk, state.size), asked_at, test)
         return state == 1
 
     return lax.cond(jnp.any(open_pairs), decide, jnp.zeros_like, open_pairs)
 
 
-def _decide(state: Array, waiting: int, chunk: int, shapes_at: ShapesAt) -> Array:
-    """Decide [q] waiting pairs by integers: 0 far, 1 near, or _WIDE if the integers are not wide enough."""
+def _decide(
+    state: Array, waiting: int, chunk: int, asked_at: Callable[[Array], Asked], test: Callable[[Asked, Array, int], Array]
+) -> Array:
+    """Decide [q] waiting pairs by integers: 0 no, 1 yes, or _WIDE if the integers are not wide enough."""
     size = len(state)
 
     def decide_chunk(carried: tuple[Array, Array]) -> tuple[Array, Array]:
@@ -168,13 +178,13 @@ def _decide(state: Array, waiting: int, chunk: int, shapes_at: ShapesAt) -> Arra
         else:  # so rare that gathering more than those near the first one is not worth its kernels
             at = jnp.minimum(first, size - chunk) + lax.iota(jnp.int32, chunk)
             at = jnp.where(lax.dynamic_slice_in_dim(state, at[0], chunk) == waiting, at, size)
-        shapes = shapes_at(jnp.minimum(at, size - 1))
-        usual, most = limb_counts(shapes.points.dtype)
+        asked = asked_at(jnp.minimum(at, size - 1))
+        usual, most = limb_counts(asked.points.dtype)
         count = usual if waiting == _USUAL else most
-        origin, width = bit_range(shapes)
-        near = is_near(shapes, origin, count).astype(jnp.int32)
-        fits = width <= limb_bits(np.dtype(shapes.points.dtype)) * count
-        state = state.at[at].set(jnp.where(fits, near, _WIDE), mode="drop")
+        origin, width = bit_range(asked.numbers)
+        found = test(asked, origin, count).astype(jnp.int32)
+        fits = width <= limb_bits(np.dtype(asked.points.dtype)) * count
+        state = state.at[at].set(jnp.where(fits, found, _WIDE), mode="drop")
         return state, first_set(state == waiting, jnp.int32(-1))
 
     start = state, first_set(state == waiting, jnp.int32(-1))

@@ -1,6 +1,6 @@
-"""The triangle test in integers, without any rounding, for pairs that floats leave undecided.
+"""The tests of triangles in integers, without any rounding, for pairs that floats leave undecided: is it near, is it crossed?
 
-The decision needs only signs of polynomials in x_i = v_i - p, the corners relative to the particle (d_i = x_(i+1) - x_i):
+The first decision needs only signs of polynomials in x_i = v_i - p, the corners relative to the particle (d_i = x_(i+1) - x_i):
 
 - a vertex is near:  |x_i|² < r²
 - a side is near between its ends:  0 < t < |d|²  and  (|x_i|² - r²) |d|² < t²,  with t = -x_i·d
@@ -43,15 +43,40 @@ class Shapes(NamedTuple):
     corners: Array
     radius: Array
 
+    @property
+    def numbers(self) -> Array:
+        """All of them, [m, k]."""
+        size = self.points.shape[1]
+        return jnp.concatenate([self.points, self.corners.reshape(-1, size), jnp.broadcast_to(self.radius, (1, size))])
+
+
+class Segments(NamedTuple):
+    """Segments, and the corners of the shapes that they may meet.
+
+    Attributes:
+        points: [d, k] coordinates where they begin.
+        ends: [d, k] where they end.
+        corners: As in `Shapes`.
+    """
+
+    points: Array
+    ends: Array
+    corners: Array
+
+    @property
+    def numbers(self) -> Array:
+        """All of them, [m, k]."""
+        return jnp.concatenate([self.points, self.ends, self.corners.reshape(-1, self.points.shape[1])])
+
 
 def limb_counts(dtype: np.dtype) -> tuple[int, int]:
     """Return how many limbs the numbers of a usual pair need, and those of any pair."""
     return _USUAL_LIMBS[dtype.itemsize], full_count(dtype)
 
 
-def bit_range(shapes: Shapes) -> tuple[Array, Array]:
-    """Return the position of the lowest set bit in any number of a pair, and the number of bits from it to the highest: [k]."""
-    _, place, mantissa = fields_of(_numbers(shapes))
+def bit_range(numbers: Array) -> tuple[Array, Array]:
+    """Return the position of the lowest set bit in any number [m, k] of a pair, and the number of bits to the highest: [k]."""
+    _, place, mantissa = fields_of(numbers)
     lowest = place + _trailing_zeros(mantissa)
     highest = place + 8 * mantissa.dtype.itemsize - lax.clz(mantissa).astype(jnp.int32)
     zero = mantissa == 0
@@ -62,7 +87,7 @@ def bit_range(shapes: Shapes) -> tuple[Array, Array]:
 def is_near(shapes: Shapes, origin: Array, count: int) -> Array:
     """Decide [k] pairs whose bits lie within `count` limbs from position `origin` [k]: is the shape closer than the cutoff?"""
     dim = shapes.points.shape[0]
-    numbers = _numbers(shapes)
+    numbers = shapes.numbers
     points, corners, radius = np.tile(np.arange(dim), dim), np.arange(dim, dim + dim * dim), len(numbers) - 1
     after = np.roll(corners.reshape(dim, dim), -1, axis=0).reshape(-1)
     ends, starts = np.concatenate([corners, after, [radius, radius]]), np.concatenate([points, corners, [radius, radius]])
@@ -73,6 +98,38 @@ def is_near(shapes: Shapes, origin: Array, count: int) -> Array:
     one[-1, 0, 0] = 1
     vectors = vectors + one  # relative corners, sides, the cutoff and 1: [rows, k, limbs]
     return _near_triangle(vectors) if dim == 3 else _near_segment(vectors)
+
+
+def is_crossed(segments: Segments, origin: Array, count: int) -> Array:
+    """Decide [k] pairs whose bits lie within `count` limbs from position `origin` [k]: does the segment meet the shape?
+
+    As `jfrnn._triangles.crossings` says, from the signs of h, of each s and of h - sum of s.
+    """
+    dim, numbers = segments.points.shape[0], segments.numbers
+    ends, starts = np.arange(dim, len(numbers)), np.tile(np.arange(dim), dim + 1)
+    limbs, lower = (limbs_of(_rows(numbers, rows), count + 1, origin[None]) for rows in (ends, starts))  # and one for the sign
+    vectors = carry_limbs(limbs - lower)  # the segment, then the corners, from where it begins: [rows, k, limbs]
+    ray, x = np.arange(dim), np.arange(dim, dim * (dim + 1)).reshape(dim, dim)
+    table = _Table()
+    if dim == 2:
+        pairs = ((x[0], x[1]), (ray, x[1]), (x[0], ray))
+        left, right, sums = table.make([table.dot(a, b[::-1], (1, -1)) for a, b in pairs])
+        found = carry_limbs(_sum_rows(sums, _product(_rows(vectors, left), _rows(vectors, right))))
+    else:
+        both = ((x[1], x[2]), (x[2], x[0]), (x[0], x[1]))
+        crosses = [table.dot(a[[j, k]], b[[k, j]], (1, -1)) for a, b in both for j, k in ((1, 2), (2, 0), (0, 1))]
+        left, right, sums = table.make(crosses)
+        cross = carry_limbs(_sum_rows(sums, _product(_rows(vectors, left), _rows(vectors, right))))
+        table = _Table()
+        left, right, sums = table.make([table.dot(x[0], range(3)), *(table.dot(ray, range(3 * c, 3 * c + 3)) for c in range(3))])
+        found = carry_limbs(_sum_rows(sums, _product(_rows(vectors, left), _rows(cross, right))))
+    across = jnp.sum(found[1:], axis=0, keepdims=True, dtype=found.dtype)
+    height, *sides, whole, rest = _signs(jnp.concatenate([found, across, found[:1] - across]))
+    above = (whole > 0) & (height >= 0) & (rest <= 0)
+    below = (whole < 0) & (height <= 0) & (rest >= 0)
+    for side in sides:
+        above, below = above & (side >= 0), below & (side <= 0)
+    return above | below
 
 
 def _near_segment(vectors: Array) -> Array:
@@ -173,11 +230,6 @@ def _product(a: Array, b: Array) -> Array:
         return lax.dynamic_update_slice_in_dim(total, window + more, GUARDS + i, axis=-1)
 
     return lax.fori_loop(0, a.shape[-1], add_moved, jnp.zeros((*shape, GUARDS + a.shape[-1] + width), a.dtype))
-
-
-def _numbers(shapes: Shapes) -> Array:
-    points, corners, radius = shapes
-    return jnp.concatenate([points, corners.reshape(-1, points.shape[1]), jnp.broadcast_to(radius, (1, points.shape[1]))])
 
 
 def _trailing_zeros(word: Array) -> Array:

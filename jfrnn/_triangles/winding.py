@@ -187,7 +187,7 @@ def _crossings(corners: Array, triangle: Array, points: Array, rays: Array) -> t
     unit = jnp.where(largest > 0, largest, 1)
     x = [[raw[:, c, k] / unit for k in range(dim)] for c in range(dim)]
     ray = [rays[:, k] for k in range(dim)]
-    sides, doubts, height, doubt = _products(x, ray)
+    sides, doubts, height, doubt = line_products(x, ray)
     doubts, doubt = [8 * finfo.eps * d + finfo.tiny for d in doubts], 8 * finfo.eps * doubt + finfo.tiny
     behind = jnp.ones_like(there)
     for corner in x:
@@ -203,7 +203,7 @@ def _crossings(corners: Array, triangle: Array, points: Array, rays: Array) -> t
     return least, may_leave.astype(jnp.int32) - sure_right.astype(jnp.int32)
 
 
-def _products(x: list[Vector], ray: Vector) -> tuple[Vector, Vector, Array, Array]:
+def line_products(x: list[Vector], ray: Vector) -> tuple[Vector, Vector, Array, Array]:
     """Return triple products of a line through the origin with each side of a shape; all have one sign if it crosses the shape.
 
     Further results are their sums of absolute values, a number that has the same sign if the shape is ahead, and its sum of

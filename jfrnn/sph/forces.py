@@ -7,10 +7,13 @@ import jax.numpy as jnp
 from jax import Array
 
 from jfrnn.sph import correction, density, solids, states, surface, transport, viscosity, walls
+from jfrnn.sph.errors import SceneError
 from jfrnn.sph.kernels import KERNELS
 from jfrnn.sph.pairs import Neighbors, Pair, Term, Values, total
 from jfrnn.sph.particles import Model, State, active, own_acceleration
-from jfrnn.sph.pressure import PRESSURES
+from jfrnn.sph.pressure import PRESSURES, less_mean
+
+_FEW = 0.5  # of what an evenly filled surrounding sums to
 
 
 class Fields(NamedTuple):
@@ -46,12 +49,18 @@ def _sum(term: Term, model: Model, s: State, values: Values, nbrs: Neighbors, of
     Where a scene's walls stand behind its fluid, rows that nobody reads are not summed: walls are most of a shallow tank. A
     particle of the fluid then meets itself at r = 0, where terms of the fluid are 0.
     """
-    options = {"box": model.box, "backend": model.backend}
+    options: dict[str, Any] = {"box": model.box, "backend": model.backend}
     if "rho" in values:  # per particle: a division per pair takes as long as the rest of a term
         values = values | {"specific": 1 / values["rho"], "volume": model.m / values["rho"]}
     values = values | {"m": model.m} | ({} if model.wall is None else {"wall": model.wall})
     entered, k = active(model, s), model.fluid_count
-    if k is None or nbrs is not None or of == "all":
+    if s.solid is not None and s.solid.sight is not None:
+        if nbrs is not None:
+            raise SceneError(
+                "nbrs must be None beside a thin solid: which pairs it parts changes in every step, and a list keeps them."
+            )
+        options["exclude"] = s.solid.sight.parted
+    if k is None or nbrs is not None or of == "all" or "exclude" in options:
         return total(term, s.x, values, model.kernel, model.physics.smoothing, nbrs, active=entered, **options)
     rows, sources = (slice(0, k), slice(None)) if of == "fluid" else (slice(k, None), slice(0, k))
     mine, theirs = ({key: value[part] for key, value in values.items()} for part in (rows, sources))
@@ -83,11 +92,15 @@ def fluid(j: Values, part: Any) -> Any:  # noqa: ANN401
 
 
 def densities(model: Model, s: State, nbrs: Neighbors) -> Array:
-    """Return densities [kg/m³], shape [n]: those that are carried, those of rest, or summed over neighbors and itself."""
+    """Return densities [kg/m³], shape [n]: those that are carried, those of rest, or summed over neighbors and itself.
+
+    Where the pressure is carried, those of rest; with a transport velocity, which keeps particles evenly spread, summed: volumes
+    are then those that particles have.
+    """
     physics = model.physics
     if s.rho is not None:
         return s.rho
-    if s.p is not None:
+    if s.p is not None and physics.transport is None:
         return jnp.broadcast_to(physics.density, s.x.shape[:1])
     own = model.kernel.value(jnp.zeros((), s.x.dtype), physics.smoothing, s.x.shape[1])
     return _sum(lambda pair, i, j: density.summation(pair, j), model, s, {}, nbrs) + model.m * own
@@ -168,11 +181,15 @@ def accelerations(model: Model, s: State, seen: Fields, nbrs: Neighbors) -> tupl
     physics = model.physics
     values = {"rho": seen.rho, "p": seen.p, "v": s.v, "u": seen.u}
     values |= {key: value for key, value in (("w", s.w), ("inverse", seen.inverse)) if value is not None}
+    if physics.viscosity_form == "fourth" and physics.viscosity is not None:
+        values["even"] = _even(model, s, seen.rho, nbrs)
+    if s.p is not None and physics.transport is not None:
+        values["mean"] = _mean_pressure(model, s, seen.p, nbrs)
     unit = model.kernel.value(jnp.asarray(model.spacing, s.x.dtype), physics.smoothing, s.x.shape[1])
 
     def term(pair: Pair, i: Values, j: Values) -> dict[str, Array]:
         gradient = _gradient(model, pair, i)
-        along = PRESSURES[physics.pressure](pair, i, j)
+        along = PRESSURES[physics.pressure](pair, *(less_mean(i, j) if "mean" in i else (i, j)))
         if physics.artificial is not None:
             along = along + viscosity.artificial(pair, i, j, physics.artificial * physics.sound_speed)
         a = along * gradient
@@ -204,6 +221,21 @@ def accelerations(model: Model, s: State, seen: Fields, nbrs: Neighbors) -> tupl
     if physics.damping is not None:
         a = a - _damping(physics.damping, physics.damped_until, s.time) * s.v
     return walls.keep_fluid(are_guided(model, s), a), sums.get("w")
+
+
+def _even(model: Model, s: State, rho: Array, nbrs: Neighbors) -> Array:
+    """Return what makes the Laplacian "fourth" right for r², a factor of each particle, shape [n]; 1 where neighbors are few."""
+    sums = _sum(lambda pair, i, j: viscosity.evenness(pair, j), model, s, {"rho": rho}, nbrs)
+    return jnp.where(sums > _FEW, 1 / jnp.where(sums > _FEW, sums, 1), 1)
+
+
+def _mean_pressure(model: Model, s: State, p: Array, nbrs: Neighbors) -> Array:
+    """Return the mean pressure [Pa] of each particle and its neighbors, shape [n].
+
+    Source: Basa, Quinlan & Lastiwka (2009), doi:10.1002/fld.1927; Ramachandran & Puri (2019), doi:10.1016/j.compfluid.2018.11.023.
+    """
+    sums = _sum(lambda pair, i, j: {"p": j["p"], "n": jnp.ones_like(j["p"])}, model, s, {"p": p}, nbrs)
+    return (sums["p"] + p) / (sums["n"] + 1)
 
 
 def _tension(model: Model, s: State, rho: Array, nbrs: Neighbors, tension: Array) -> Array:

@@ -14,6 +14,7 @@ from jfrnn.cases.fluids import Gas, Physics, Turning
 from jfrnn.sph.errors import SceneError
 from jfrnn.sph.kernels import KERNELS, Kernel
 from jfrnn.sph.pairs import reach
+from jfrnn.sph.sight import Sight
 
 Force = Callable[["State"], Array]
 jax.tree_util.register_dataclass(
@@ -122,6 +123,7 @@ class Beside(NamedTuple):
         mask: It is within reach, shape [n], bool.
         distance: To it [m], shape [n].
         normal: Away from it, of unit length, in its frame, shape [n, d].
+        sight: Pairs that it parts; None: it is nowhere thin.
     """
 
     tri: jfrnn.TriangleList
@@ -129,6 +131,12 @@ class Beside(NamedTuple):
     mask: Array
     distance: Array
     normal: Array
+    sight: Sight | None = None
+
+    @property
+    def overflow(self) -> Array:
+        """Whether triangles or parted pairs may be missing because room was, shape [], bool."""
+        return self.tri.overflow if self.sight is None else self.tri.overflow | self.sight.overflow
 
 
 class Thermal(NamedTuple):

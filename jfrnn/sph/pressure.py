@@ -1,7 +1,7 @@
 """Pressure force, in the forms that are in use: each returns the factor of ∇W in what neighbor j adds to the acceleration of i.
 
 ∇W is the gradient at i [1/m^(d+1)], shape [d]; factors have shape []. All forms but `difference` are antisymmetric in mass times
-acceleration: with them momentum is kept to the rounding of the sums.
+acceleration: with them momentum is kept to the rounding of the sums, unless pressures are `less_mean`.
 """
 
 from jax import Array
@@ -42,6 +42,14 @@ def source(pair: Pair, i: Values, j: Values) -> Array:
     Source: Müller, Charypar & Gross (2003), doi:10.2312/SCA03/154-159, eq. 10; ReCoDE-SPH-solver-2D-NS (2024).
     """
     return -j["volume"] * (i["p"] + j["p"]) / 2 * pair.h * i["specific"]
+
+
+def less_mean(i: Values, j: Values) -> tuple[Values, Values]:
+    """Return both with pressures less `mean` of i, which the sum does not feel where particles lie evenly; momentum is not kept.
+
+    Source: Basa, Quinlan & Lastiwka (2009), doi:10.1002/fld.1927.
+    """
+    return i | {"p": i["p"] - i["mean"]}, j | {"p": j["p"] - i["mean"]}
 
 
 PRESSURES = {"symmetric": symmetric, "mean": mean, "volume": volume, "difference": difference, "source": source}

@@ -18,7 +18,7 @@ from jfrnn.sph.errors import SceneError
 from jfrnn.sph.interrupts import hold_interrupts
 from jfrnn.sph.model import choose_dtype, make_model, make_state
 from jfrnn.sph.pairs import Neighbors
-from jfrnn.sph.particles import Flow, Force, State, active
+from jfrnn.sph.particles import Flow, Force, GasModel, State, active
 from jfrnn.sph.probes import Probe, columns
 from jfrnn.sph.progress import Progress
 
@@ -161,7 +161,7 @@ def _first_neighbors(scene: Scene, model: Flow, s: State, how: How) -> Neighbors
     way = faster_way(jax.default_backend(), scene.n) if how.neighbors == "auto" else how.neighbors
     nbrs = solver.list_neighbors(model, s, how.skin * scene.spacing) if way == "list" else None
     if how.neighbors == "list" and nbrs is None:
-        raise SceneError(f"neighbors 'list': the cutoffs of scene {scene.name!r} change in every step; take pair_sum or auto")
+        raise SceneError(f"neighbors 'list': which pairs scene {scene.name!r} has changes in every step; take pair_sum or auto")
     return nbrs
 
 
@@ -177,10 +177,9 @@ def _chunk(model: Flow, s: State, nbrs: Neighbors, goal: float, most: int) -> tu
     """Run steps to a time [s], at most so many, and return their number; where a row of a list overflowed, all again."""
     while True:
         after, seen, steps = _chunk_of_particles(model, s, nbrs, goal, most)
-        if s.solid is None or after.solid is None or not after.solid.tri.overflow:
+        if isinstance(model, GasModel) or after.solid is None or not after.solid.overflow:
             return after, seen, int(steps)
-        larger = after.solid.tri.grow(solids.into_frame(s.x, model.turning, s.solid.angle))
-        s = s._replace(solid=s.solid._replace(tri=larger))
+        s = solids.grow(model, s, after.solid)
 
 
 def _chunk_of_particles(model: Flow, s: State, nbrs: Neighbors, goal: float, most: int) -> tuple[State, Neighbors, Array | int]:

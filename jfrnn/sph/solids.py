@@ -11,6 +11,7 @@ that ends nearer than a gap is put one gap away; one that after that is not outs
 the wall. Rounding is many orders smaller than the gap.
 """
 
+import math
 from typing import NamedTuple
 
 import jax
@@ -21,6 +22,7 @@ from jax import Array
 import jfrnn
 from jfrnn.cases import fluids
 from jfrnn.cases.fluids import FluidScene, Scene, Turning
+from jfrnn.sph import sight
 from jfrnn.sph.errors import SceneError
 from jfrnn.sph.kernels import KERNELS, Kernel
 from jfrnn.sph.pairs import reach
@@ -46,9 +48,10 @@ def begin(scene: FluidScene, x: Array, angle: Array | None = None) -> Beside | N
     if solid is None:
         return None
     vertices, faces, cutoff = jnp.asarray(solid.vertices, x.dtype), jnp.asarray(solid.faces), _reach(scene)
-    on_wall = vertices[faces].mean(axis=1)
-    longest = int(jfrnn.search_triangles(on_wall, vertices, faces, cutoff).required)
-    capacity = -(-longest * 3 // 16) * 8  # half as many again; a run that needs more is told by `overflow`
+    corners = np.asarray(vertices)[solid.faces]
+    on_wall = jfrnn.search_triangles(sight.points_on(corners), vertices, faces, cutoff)
+    thin = sight.is_thin(corners, on_wall) if solid.thin is None else solid.thin
+    capacity = -(-int(on_wall.required) * 3 // 16) * 8  # half as many again; a run that needs more is told by `overflow`
     turning = turning_of(scene, x.dtype)
     angle = jnp.zeros((), x.dtype) if turning is not None and angle is None else angle
     at = into_frame(x, turning, angle)
@@ -68,7 +71,36 @@ def begin(scene: FluidScene, x: Array, angle: Array | None = None) -> Beside | N
         raise SceneError(
             f"positions of the fluid must be outside the solid by {GAP / 2} spacings: particle {inside.argmax()} is not."
         )
-    return Beside(tri, angle, signed.mask, signed.distance, signed.normal)
+    seen = Beside(tri, angle, signed.mask, signed.distance, signed.normal)
+    if not thin:
+        return seen
+    neighbors = _neighbors(scene.spacing, cutoff, scene.dim)
+    return _look_through(seen, at, sight.make_room(np.array([int(jnp.sum(tri.count > 0)), 0, 0]), neighbors, scene.n), neighbors)
+
+
+def _neighbors(spacing: float, cutoff: float, dim: int) -> float:
+    """Return how many neighbors a particle in the fluid has."""
+    return (math.pi if dim == len("xy") else 4 / 3 * math.pi) * (cutoff / spacing) ** dim
+
+
+def _look_through(seen: Beside, at: Array, room: sight.Sight, neighbors: float) -> Beside:
+    """Return what is seen with the pairs that the wall parts, in room enough."""
+    while True:
+        found = sight.look(room, seen.tri, at, seen.normal, None)
+        if not found.overflow:
+            return seen._replace(sight=found)
+        room = sight.make_room(np.asarray(found.required), neighbors, len(at))
+
+
+def grow(model: Model, s: State, after: Beside) -> State:
+    """Return a state that sees the wall with more room: with what turned out to be needed until `after`."""
+    assert s.solid is not None, "there is a wall"
+    at = into_frame(s.x, model.turning, s.solid.angle)
+    seen = s.solid._replace(tri=after.tri.grow(at) if after.tri.overflow else s.solid.tri)
+    if after.sight is not None and after.sight.overflow:
+        neighbors = _neighbors(model.spacing, model.cutoff, s.x.shape[1])
+        seen = _look_through(seen, at, sight.make_room(np.asarray(after.sight.required), neighbors, len(at)), neighbors)
+    return s._replace(solid=seen)
 
 
 def _reach(scene: FluidScene) -> float:
@@ -154,7 +186,12 @@ def keep_out(model: Model, s: State, x: Array, v: Array, dt: Array, rests: Array
         jnp.where(stays if was.ndim == 1 else stays[:, None], was, now)
         for was, now in zip((old.mask, old.distance, old.normal), after, strict=True)
     ]
-    return s._replace(x=x, v=v, solid=Beside(tri, angle, *seen))
+    now = Beside(tri, angle, seen[0], seen[1], seen[2])
+    if old.sight is not None:
+        at = jnp.where(stays[:, None], before, placed)
+        tri = tri.update(at)  # no triangle is missing in the row of a particle that was put right
+        now = now._replace(tri=tri, sight=sight.look(old.sight, tri, at, now.normal, active(model, s)))
+    return s._replace(x=x, v=v, solid=now)
 
 
 def integrate_missing(kernel: Kernel, distance: Array, h: float, dim: int) -> tuple[Array, Array]:

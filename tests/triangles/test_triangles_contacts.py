@@ -150,6 +150,7 @@ def test_of_equal_triangles_the_first_remains():
         )
 
 
+@pytest.mark.slow
 def test_derivatives_are_those_of_closest():
     x, vertices, faces = plate_and_points()
     tri = jfrnn.search_triangles(x, vertices, faces, 0.35, capacity=CAPACITY)  # as many as near nothing

@@ -56,13 +56,15 @@ def test_couette_flow_at_18_particles():
 
 
 @pytest.mark.slow
-def test_taylor_green_vortices_at_24_particles():
-    scene = fluids.fluid("taylor-green", nx=24, duration=0.3)
+@pytest.mark.parametrize(("transport", "l1", "most"), [(None, 0.004, 0.006), (100.0, 0.04, 0.02)])
+def test_taylor_green_vortices_at_24_particles(transport, l1, most):
+    """Without fourth order, energy is 1.3 % too high by then; without volumes of particles and mean pressures, 12 % too low."""
+    scene = fluids.fluid("taylor-green", nx=24, duration=0.3, jitter=0.2, transport=transport)
     _, s = run(scene)
     x, v = np.asarray(s.x), np.asarray(s.v)
     exact = taylor_green_velocity(x, float(s.time), 100.0)
-    assert np.abs(np.linalg.norm(v, axis=1) - np.linalg.norm(exact, axis=1)).mean() < 0.01 * np.linalg.norm(exact, axis=1).mean()
-    assert (v**2).sum() == pytest.approx((exact**2).sum(), rel=0.02)
+    assert np.abs(np.linalg.norm(v, axis=1) - np.linalg.norm(exact, axis=1)).mean() < l1 * np.linalg.norm(exact, axis=1).mean()
+    assert (v**2).sum() == pytest.approx((exact**2).sum(), rel=most)
 
 
 @pytest.mark.slow

@@ -52,6 +52,8 @@ VALUES = (
         "v": [0.1, 0.3],
         "u": [0.1, 0.3],
         "w": [0.02, 0.0],
+        "even": 1.1,
+        "mean": 7.0,
     },
     {
         "m": 1.4,
@@ -62,6 +64,8 @@ VALUES = (
         "v": [-0.4, 0.2],
         "u": [-0.4, 0.2],
         "w": [0.0, -0.01],
+        "even": 0.9,
+        "mean": 4.0,
     },
 )
 
@@ -73,6 +77,7 @@ def forces(name, r, i, j):
     terms = {
         **{f"pressure {key}": lambda key=key: pressure.PRESSURES[key](pair, i, j) * gradient for key in pressure.PRESSURES},
         **{f"viscosity {key}": lambda key=key: viscosity.VISCOSITIES[key](pair, i, j, 0.01) for key in viscosity.VISCOSITIES},
+        "less the mean pressure": lambda: pressure.volume(pair, *pressure.less_mean(i, j)) * gradient,
         "artificial": lambda: viscosity.artificial(pair, i, j, 3.0) * gradient,
         "cohesion": lambda: surface.cohesion(pair, i, j, 2.0, 0.3),
         "transport": lambda: transport.transport(pair, i, j, 50.0),
@@ -90,7 +95,7 @@ def test_forces_of_a_pair_are_opposite_where_a_form_keeps_momentum(name):
     (there, mass_i), (back, mass_j) = forces(name, [0.06, 0.05], i, j), forces(name, [-0.06, -0.05], j, i)
     there, back = mass_i * there[name](), mass_j * back[name]()
     assert np.abs(there).max() > 0
-    keeps = name != "pressure difference"  # as its docstring says
+    keeps = name not in ("pressure difference", "less the mean pressure")  # as their docstrings say
     assert np.allclose(there, -back, rtol=1e-12, atol=0) == keeps
 
 

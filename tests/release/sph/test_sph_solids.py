@@ -102,7 +102,7 @@ def test_nothing_passes_however_it_is_thrown(turning):
     """Particles thrown about at random around a gear with few, sharp teeth, many of them farther than its walls are thick."""
     random = np.random.default_rng(1)
     low, high = SHARP[0].min(axis=0) - 0.3, SHARP[0].max(axis=0) + 0.3
-    scene = beside(fluids.Solid(*SHARP, turning), random.uniform(low, high, (400, 3)), 0.2)
+    scene = beside(fluids.Solid(*SHARP, turning, thin=False), random.uniform(low, high, (400, 3)), 0.2)
     outside = ~is_inside(scene.positions, scene, 0.0)
     apart = np.array([np.min(np.linalg.norm(SHARP[0][SHARP[1]].mean(axis=1) - x, axis=1)) for x in scene.positions])
     scene = replace(beside(scene.solid, scene.positions[outside & (apart > 0.1)], 0.2), step=0.05)
