@@ -5,6 +5,8 @@ import importlib
 import itertools
 import subprocess
 import sys
+import tomllib
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -16,6 +18,8 @@ import jfrnn.matscipy
 import jfrnn.vesin
 from jfrnn.ase import neighbor_list, primitive_neighbor_list
 from jfrnn.cases.periodic import PERIODIC_CASES
+
+ROOT = Path(__file__).parents[2]
 
 
 def as_set(i, j, s):
@@ -182,10 +186,36 @@ def test_what_is_no_structure_is_refused():
         neighbor_list("ij", np.zeros((2, 3)), 1.0)
 
 
-def test_it_takes_no_device_of_jax():
-    code = "import jax, numpy as np; from jfrnn.ase import primitive_neighbor_list as find; find('i', True, np.eye(3), "
-    code += "np.zeros((1, 3)), 2.0); assert not jax._src.xla_bridge.backends_are_initialized()"
-    subprocess.run([sys.executable, "-c", code], check=True)
+PLUGIN = """
+import sys, types
+from importlib.metadata import EntryPoint
+
+class Plugin:
+    def __init__(self, name, **given):
+        vars(self).update(name=name, module=None, **given)
+
+ase4 = types.SimpleNamespace(NeighborListPlugin=Plugin)
+names = ["ase", "ase._4", "ase._4.plugins", "ase._4.plugins.neighborlist"]
+sys.modules |= dict.fromkeys(names, ase4)
+[plugin] = EntryPoint("jfrnn", %r, "ase.plugins").load().__ase_plugins__
+assert not {"jax", "jfrnn", "numpy"} & sys.modules.keys()
+for name in names:
+    del sys.modules[name]
+import jfrnn.ase
+path, _, function = plugin.implementation.rpartition(".")
+assert getattr(sys.modules[path], function) is jfrnn.ase.neighbor_list
+assert (plugin.name, plugin.module.__name__) == ("jfrnn", "jfrnn")
+
+import jax, numpy as np
+jfrnn.ase.primitive_neighbor_list("i", True, np.eye(3), np.zeros((1, 3)), 2.0)
+assert not jax._src.xla_bridge.backends_are_initialized()
+"""
+
+
+def test_it_takes_no_device_of_jax_and_its_plugin_no_module():
+    """ASE imports the plugin whenever it collects plugins; of its released versions, 3.29 has no `NeighborListPlugin` yet."""
+    entries = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["entry-points"]["ase.plugins"]
+    subprocess.run([sys.executable, "-c", PLUGIN % entries["jfrnn"]], check=True, cwd=ROOT)
 
 
 @pytest.mark.parametrize("bothways", [True, False])

@@ -66,7 +66,7 @@ def test_wheel_works_elsewhere(wheel, tmp_path):
 
 def test_wheel_holds_the_library_alone(wheel):
     names = zipfile.ZipFile(wheel).namelist()
-    assert {name.split("/")[0] for name in names} == {"jfrnn", f"jfrnn-{jfrnn.__version__}.dist-info"}
+    assert {name.split("/")[0] for name in names} == {"jfrnn", "jfrnn_ase_plugin.py", f"jfrnn-{jfrnn.__version__}.dist-info"}
     assert {Path(name).suffix for name in names if not name.startswith("jfrnn-")} == {".py", ".typed", ".h", ".cuh"}
     held = {Path(name).name for name in names if "/native/" in name}
     assert held == {path.name for path in (ROOT / "kernels" / "native").iterdir() if path.suffix in (".py", ".h", ".cuh")}
