@@ -166,6 +166,9 @@ BAD = {
     r"cutoff must be a number, a dictionary, or radii of shape \[2\]": {"cutoff": np.ones(3)},
     "cutoff must be finite and at least 0": {"cutoff": -1.0},
     "cutoff must be finite and at least 0, got inf for": {"cutoff": {(1, 1): np.inf}, "numbers": [1, 1]},
+    r"cutoff must be a number \[length\], a dictionary of numbers, or radii of all atoms, got str": {"cutoff": "3"},
+    r"cutoff must be a number \[length\] for \(1, 1\), got str": {"cutoff": {(1, 1): "2"}, "numbers": [1, 1]},
+    r"cutoff must be a number \[length\] for \('H', 6\), got shape \[1\]": {"cutoff": {("H", 6): [2.0]}, "numbers": [1, 1]},
     "keys of cutoff must be pairs of symbols or numbers": {"cutoff": {("H", "Q"): 1.0}, "numbers": [1, 1]},
     "cutoff must not be a defaultdict of 2.0 with other values": {"cutoff": collections.defaultdict(lambda: 2.0, {(1, 1): 1.0})},
     "a dictionary of cutoffs needs numbers": {"cutoff": {(1, 1): 1.0}},
@@ -316,6 +319,8 @@ def test_forms_of_matscipy_and_vesin():
     }
     with pytest.raises(ValueError, match="quantities must be letters of 'ijPSDd'"):
         jfrnn.vesin.NeighborList(cutoff=2.0, full_list=True).compute(x, cell, True, "x")
+    with pytest.raises(TypeError, match=r"cutoff must be a number \[length\], got list"):
+        jfrnn.vesin.NeighborList(cutoff=["a"], full_list=True)
     with pytest.raises(ValueError, match="algorithm must be"):
         jfrnn.vesin.NeighborList(cutoff=2.0, full_list=True, algorithm="tree")
 
