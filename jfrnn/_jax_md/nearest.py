@@ -143,7 +143,7 @@ def neighbor_list(
         elif "box" in kwargs:
             space = Space(kwargs["box"], True)
         radius, kept = cutoff if exact else max(reach * dim**0.5 - skin, reach), None
-        given = {"skin": skin, "include_self": exact and not mask_self}
+        given = {"skin": skin, "include_self": not mask_self}
         if dim in (2, 3) and position.dtype in (np.float32, np.float64) and not disable_cell_list:
             given |= {"box": _box_of(space, dim)}
             kept = search(position, radius, slack=max(float(capacity_multiplier), 1.0), **given)
