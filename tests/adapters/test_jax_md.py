@@ -197,8 +197,12 @@ def test_boxes_of_lists_that_are_measured():
     assert pairs_of(nbrs.idx, N, jax_md.Dense) == expected(x, "fractional", jax_md.Dense)
     box = 1.1 * MATRIX
     near = reference.reference_images(x @ box.T, CUTOFF + SKIN, matrix=box.T, periodic=(True,) * 3)
-    wide = jax.jit(lambda x, nbrs, box: nbrs.update(x, box=box, neighbor=nbrs))(x, nbrs, box)
+    update = jax.jit(lambda x, nbrs, box: nbrs.update(x, box=box, neighbor=nbrs))
+    wide = update(x, nbrs, box)
     assert pairs_of(wide.idx, N, jax_md.Dense) == {(i, j) for i, j, _ in near}
+    still = update(x + 0.001, wide, box)  # a box that is still the same is none to measure in again
+    np.testing.assert_array_equal(still.reference_position, x)
+    assert (np.asarray(update(x, still, 0.9 * box).idx) < N).sum() > len(near)
 
 
 EDGE, SHEAR = 3.0, np.array([[1.0, 0.001, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])

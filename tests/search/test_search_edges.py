@@ -307,7 +307,9 @@ def test_where_rows_begin_never_wraps():
     np.testing.assert_array_equal(jax.jit(add_up)(jnp.asarray(counts[:3])), exact[:4])
 
 
-@pytest.mark.parametrize(("backend", "include_self"), [("warp", False), pytest.param("warp", True, marks=SLOW), ("jax", False)])
+@pytest.mark.parametrize(
+    ("backend", "include_self"), [("warp", False), *(pytest.param(*each, marks=SLOW) for each in (("warp", True), ("jax", False)))]
+)
 def test_own_images_in_half_lists(backend, include_self):
     """They are listed once, and so counted, with and without a program, where both ends of a pair are one particle."""
     x, lengths = points(5), np.array([0.25, 0.25, 0.25])
