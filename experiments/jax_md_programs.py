@@ -35,7 +35,7 @@ def run(program: str, who: str, checkout: str) -> None:
     """Run a program in this process and folder, and write its last state to `state.npz`."""
     library, _, what = program.partition(" ")
     state = run_jax_sph(what, who, checkout) if library == "jax-sph" else {"jax-md": run_in_jax_md, "ASE": run_in_ase}[what](who)
-    np.savez("state.npz", **state)
+    np.savez("state.npz", **state)  # pyright: ignore[reportArgumentType]
 
 
 def run_jax_sph(case: str, who: str, checkout: str) -> dict[str, np.ndarray]:

@@ -50,7 +50,7 @@ def programs() -> str:
 def versions() -> str:
     """Return the commit of jax-sph that was run, and the version of nequix."""
     found = {row["program"].partition(" ")[0]: row["version"] for row in read(PROGRAMS)}
-    return f"commit {found['jax-sph']}; nequix {found['nequix']}"
+    return f"jax-sph at {found['jax-sph']}, nequix {found['nequix']}"
 
 
 def _first() -> Row:
@@ -63,4 +63,4 @@ def commit() -> str:
 
 
 TABLES = {"jax-md-tests": own_tests, "jax-md-contested": contested, "jax-md-programs": programs}
-VALUES = {"jax-md-commit": commit, "jax-sph-commit": versions}
+VALUES = {"jax-md-commit": commit, "jax-md-programs": versions}

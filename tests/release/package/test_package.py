@@ -40,7 +40,7 @@ def run(*arguments, cwd, python=sys.executable, **environment):
 
 def build_wheel(folder):
     """Build a wheel of a copy of the tree, without what an earlier build left, and without the internet."""
-    for name in ("jfrnn", "kernels", "cases", "pyproject.toml", "setup.py", "README.md", "LICENSE"):
+    for name in ("jfrnn", "jfrnn_ase_plugin.py", "kernels", "cases", "pyproject.toml", "setup.py", "README.md", "LICENSE"):
         (folder / "tree").mkdir(exist_ok=True)
         (folder / "tree" / name).symlink_to(ROOT / name)
     build = ("-m", "pip", "wheel", "--quiet", "--no-deps", "--no-build-isolation", "--wheel-dir", str(folder), str(folder / "tree"))
