@@ -94,14 +94,14 @@ def pytest_runtest_logreport(report: Any) -> None:  # noqa: ANN401
     theirs, ours = os.environ[_COMMITS].split()
     told = str(report.longrepr[-1] if isinstance(report.longrepr, tuple) else report.longrepr or "").strip()
     row = (report.nodeid.partition("::")[0].rpartition("/")[2], _name(report.nodeid), _who())
-    outcome = _judge(told) if report.outcome == "failed" else report.outcome
+    outcome = judge(told) if report.outcome == "failed" else report.outcome
     reason = [told.splitlines()[-1][:200] if told else ""]
     with Path(os.environ[_ROWS]).open("a", newline="") as file:
         csv.writer(file).writerow((*row, outcome, f"{report.duration:.1f}", *reason, theirs, version("jax"), ours))
 
 
-def _judge(told: str) -> str:
-    """Say of an error whether jfrnn raised it: the last file that it names is then one of the library."""
+def judge(told: str) -> str:
+    """Say of an error whether jfrnn raised it, "refused": the last file that it names is then one of the library; else "failed"."""
     files = re.findall(r"([\w./-]+\.py)(?:\", line |:\d)", told)
     return "refused" if files and "jfrnn" in Path(files[-1]).parts else "failed"
 
@@ -127,7 +127,7 @@ def run(checkout: Path, file: str, ours: bool, options: list[str], out: Path) ->
     if not out.exists():
         out.write_text(",".join(COLUMNS) + "\n")
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(checkout), str(ROOT), os.environ.get("PYTHONPATH", "")])}
-    commits = [_commit(folder) for folder in (checkout, ROOT)]
+    commits = [commit_of(folder) for folder in (checkout, ROOT)]
     environment |= {_ROWS: str(out), _COMMITS: " ".join(commits), "READTHEDOCS": "True", "MPLBACKEND": "agg"}
     environment |= {_OURS: "1"} if ours else {}
     if file in EXAMPLES:
@@ -147,7 +147,7 @@ def _run_example(path: Path, key: tuple[str, ...], environment: dict[str, str], 
     with tempfile.TemporaryDirectory() as folder:
         command = [sys.executable, "-c", f"from experiments import jax_md_tests as own; own.run_example({str(path)!r})"]
         done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment, cwd=folder)
-    outcome = _judge(done.stderr) if done.returncode else "passed"
+    outcome = judge(done.stderr) if done.returncode else "passed"
     lines = (done.stderr if done.returncode else done.stdout).strip().splitlines()
     numbers = [line for line in lines if re.search(r"\d\.\d", line)] if not done.returncode else lines
     theirs, ours = environment[_COMMITS].split()
@@ -156,7 +156,8 @@ def _run_example(path: Path, key: tuple[str, ...], environment: dict[str, str], 
         csv.writer(file).writerow(row)
 
 
-def _commit(folder: Path) -> str:
+def commit_of(folder: Path) -> str:
+    """Return the commit of a checkout, in twelve letters."""
     told = subprocess.run(["git", "rev-parse", "--short=12", "HEAD"], cwd=folder, capture_output=True, text=True, check=False)
     return told.stdout.strip() or "unknown"
 

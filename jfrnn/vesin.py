@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from jfrnn._ase import half_of, primitive_neighbor_list
+from jfrnn._ase import check_number, half_of, primitive_neighbor_list
 from jfrnn._ase import neighbor_list as ase_neighbor_list
 
 __all__ = ["NeighborList", "ase_neighbor_list"]
@@ -45,7 +45,7 @@ class NeighborList:
         """
         if algorithm.lower() not in ("auto", "brute_force", "cell_list"):
             raise ValueError(f"algorithm must be 'auto', 'brute_force' or 'cell_list', got {algorithm!r}.")
-        self.cutoff, self.full_list = float(cutoff), bool(full_list)
+        self.cutoff, self.full_list = check_number(cutoff), bool(full_list)
 
     def compute(
         self, points: Given, box: Given, periodic: Given, quantities: str = "ij", copy: bool = True

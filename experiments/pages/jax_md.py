@@ -3,7 +3,7 @@
 from experiments.jax_md_tests import EXAMPLES, FILES, LISTS
 from experiments.pages.rows import Row, markdown, read, whole
 
-ROWS = "jax_md/outcomes.csv"
+ROWS, PROGRAMS = "jax_md/outcomes.csv", "jax_md/programs.csv"
 
 
 def _outcomes(file: str) -> dict[str, dict[str, str]]:
@@ -37,6 +37,22 @@ def contested() -> str:
     return markdown(heads, [[row["case"], *map(whole, [*row.values()][1:])] for row in read("jax_md/contested.csv")])
 
 
+def programs() -> str:
+    """Return what became of whole programs with either list, and by how much their last states differ."""
+    rows = {(row["program"], row["list"]): row for row in read(PROGRAMS)}
+    lines = []
+    for program in dict.fromkeys(program for program, _ in rows):
+        theirs, ours = (rows[program, who] for who in LISTS)
+        lines.append([program, ours["outcome"], theirs["outcome"], ours["difference"]])
+    return markdown(("program", "with jfrnn", "with its own list", ">difference"), lines)
+
+
+def versions() -> str:
+    """Return the commit of jax-sph that was run, and the version of nequix."""
+    found = {row["program"].partition(" ")[0]: row["version"] for row in read(PROGRAMS)}
+    return f"jax-sph at {found['jax-sph']}, nequix {found['nequix']}"
+
+
 def _first() -> Row:
     return read(ROWS)[0]
 
@@ -46,5 +62,5 @@ def commit() -> str:
     return f"commit {_first()['jax_md_commit']}, JAX {_first()['jax']}"
 
 
-TABLES = {"jax-md-tests": own_tests, "jax-md-contested": contested}
-VALUES = {"jax-md-commit": commit}
+TABLES = {"jax-md-tests": own_tests, "jax-md-contested": contested, "jax-md-programs": programs}
+VALUES = {"jax-md-commit": commit, "jax-md-programs": versions}

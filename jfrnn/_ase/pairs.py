@@ -117,8 +117,8 @@ def primitive_neighbor_list(
     wrong = not isinstance(quantities, str) or not quantities or set(quantities) - set("ijdDS")
     if wrong:
         raise ValueError(f"quantities must be letters of 'ijdDS', as in 'ijS', got {quantities!r}.")
-    x = _array("positions", positions, "n, 3")
-    vectors = _array("cell", cell, "3, 3")
+    x = _array("positions", positions, "real numbers of shape [n, 3]")
+    vectors = _array("cell", cell, "real numbers of shape [3, 3]")
     vectors = np.diag(vectors) if vectors.ndim == 1 else vectors
     if x.ndim != 2 or x.shape[1] != 3 or vectors.shape != (3, 3):
         raise ValueError(
@@ -139,13 +139,28 @@ def half_of(i: np.ndarray, j: np.ndarray, shifts: np.ndarray) -> np.ndarray:
     return np.where(ahead != 0, ahead > 0, i <= j)
 
 
-def _array(name: str, value: Given, shape: str) -> np.ndarray:
+def check_number(cutoff: Given, pair: Given = None) -> float:
+    """Return one cutoff, of a pair of species if that is given.
+
+    Raises:
+        TypeError, ValueError: it is no number, or negative or not finite.
+    """
+    of_pair = "" if pair is None else f" for {pair!r}"
+    value = _array("cutoff", cutoff, f"a number [length]{of_pair}")
+    if value.ndim:
+        raise TypeError(f"cutoff must be a number [length]{of_pair}, got shape {list(value.shape)}.")
+    if not 0 <= value < math.inf:
+        raise ValueError(f"cutoff must be finite and at least 0, got {cutoff!r}{of_pair}.")
+    return float(value)
+
+
+def _array(name: str, value: Given, what: str) -> np.ndarray:
     try:
         array = np.asarray(value)
         if array.dtype.kind not in "fiu":
             raise TypeError(f"dtype {array.dtype}")
     except (TypeError, ValueError) as error:
-        raise TypeError(f"{name} must be real numbers of shape [{shape}], got {type(value).__name__} ({error}).") from error
+        raise TypeError(f"{name} must be {what}, got {type(value).__name__} ({error}).") from error
     return np.asarray(array, np.float64, order="C")
 
 
@@ -167,14 +182,16 @@ def _cutoffs(cutoff: Given, n: int, numbers: Given) -> tuple[np.ndarray, str, np
         cutoff = made
     if isinstance(cutoff, Mapping):
         return _table(cutoff, n, numbers)
-    values = _array("cutoff", cutoff, "n, or one number, or a dictionary")
-    if values.shape not in ((), (n,)):
+    values = _array("cutoff", cutoff, "a number [length], a dictionary of numbers, or radii of all atoms")
+    if not values.ndim:
+        return np.array([check_number(cutoff)]), "one", None
+    if values.shape != (n,):
         raise ValueError(
             f"cutoff must be a number, a dictionary, or radii of shape [{n}], one per atom, got shape {list(values.shape)}."
         )
     if not ((values >= 0) & (values < math.inf)).all():
         raise ValueError(f"cutoff must be finite and at least 0, got {cutoff!r}.")
-    return (values, "radii", None) if values.ndim else (values.reshape(1), "one", None)
+    return values, "radii", None
 
 
 def _table(cutoff: Mapping, n: int, numbers: Given) -> tuple[np.ndarray, str, np.ndarray]:
@@ -190,9 +207,8 @@ def _table(cutoff: Mapping, n: int, numbers: Given) -> tuple[np.ndarray, str, np
         known = isinstance(pair, tuple) and len(pair) == 2 and all(isinstance(x, int | np.integer) or x in _NUMBERS for x in pair)
         if not known:
             raise ValueError(f"keys of cutoff must be pairs of symbols or numbers, as in ('C', 'H') or (6, 1), got {pair!r}.")
-        if not 0 <= value < math.inf:
-            raise ValueError(f"cutoff must be finite and at least 0, got {value!r} for {pair!r}.")
+        number = check_number(value, pair)
         a, b = (places.get(_NUMBERS[x] if x in _NUMBERS else int(x), -1) for x in pair)
         if min(a, b) >= 0:
-            table[a, b] = table[b, a] = value
+            table[a, b] = table[b, a] = number
     return table, "table", np.ascontiguousarray(species, np.int32)

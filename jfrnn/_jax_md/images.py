@@ -119,7 +119,10 @@ def neighbor_list_multi_image(
         position = jnp.asarray(position)
         n, dim = position.shape
         if dim not in (2, 3):
-            raise ValueError(f"position must have shape [n, 2] or [n, 3], got {list(position.shape)}: in 1D, install jax-md.")
+            raise ValueError(
+                f"position must have shape [n, 2] or [n, 3], got {list(position.shape)}: in 1D, install jax-md, and pass box as a "
+                "matrix [1, 1]; the list is then jax-md's own."
+            )
         matrix, made = box_of(box, dim)
         kept = search(position, cutoff, box=made, skin=skin, slack=max(float(capacity_multiplier), 1.0))
         kept.check()

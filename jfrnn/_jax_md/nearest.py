@@ -33,6 +33,7 @@ class NeighborList(partition.NeighborList):
             all others that of an overflow.
         kept: The list of jfrnn from which idx comes, or None where all pairs are measured by the displacement function.
         occupancy: How much room idx takes, shape [], int32; over all updates, it may exceed `max_occupancy`.
+        measured_in: The matrix of box= with which the displacement function last chose the pairs, shape [d, d]; NaN without.
         exact: Whether pairs are those of `kept`, decided exactly; else the displacement function chooses among them. Static.
         cell_list_capacity, cell_size, cell_list_fn: None.
         max_occupancy, format, update_fn: As in jax-md. Static.
@@ -40,6 +41,7 @@ class NeighborList(partition.NeighborList):
 
     kept: Kept | None
     occupancy: Array
+    measured_in: Array
     exact: bool = dataclasses.field(metadata={"static": True})
 
 
@@ -117,14 +119,18 @@ def neighbor_list(
         flat = flatten(used, room)
         return jnp.stack([jnp.where(flat.rows < n, rows.reshape(-1)[flat.slots], n), flat.rows]), flat.offsets[-1]
 
+    @jax.jit  # as in jax-md: XLA rounds numbers of bfloat16 less often in a program
+    def are_near(position: Array, rows: Array, **kwargs: Given) -> Array:
+        of_row = jax.vmap(functools.partial(squared, **kwargs), (None, 0))
+        return jax.vmap(of_row)(position, position[rows]) < reach**2
+
     def rows_of(position: Array, kept: Kept | None, exact: bool, kwargs: dict[str, Given]) -> Array:
         """Return the neighbors of each particle, where n means none."""
         if kept is not None and exact:
             return kept.idx
         n, own = len(position), jnp.arange(len(position), dtype=jnp.int32)
         rows = jnp.broadcast_to(own, (n, n)) if kept is None else kept.idx
-        of_row = jax.vmap(functools.partial(squared, **kwargs), (None, 0))
-        near = (rows < n) & (jax.vmap(of_row)(position, position[rows]) < reach**2)
+        near = (rows < n) & are_near(position, rows, **kwargs)
         near = near & (rows != own[:, None]) if mask_self else near
         return jnp.where(near, rows, n)
 
@@ -143,7 +149,7 @@ def neighbor_list(
         elif "box" in kwargs:
             space = Space(kwargs["box"], True)
         radius, kept = cutoff if exact else max(reach * dim**0.5 - skin, reach), None
-        given = {"skin": skin, "include_self": exact and not mask_self}
+        given = {"skin": skin, "include_self": not mask_self}
         if dim in (2, 3) and position.dtype in (np.float32, np.float64) and not disable_cell_list:
             given |= {"box": _box_of(space, dim)}
             kept = search(position, radius, slack=max(float(capacity_multiplier), 1.0), **given)
@@ -161,7 +167,8 @@ def neighbor_list(
         idx, held = finish(rows, room, exact)
         error = partition.PartitionError(jnp.where(held > room, 1, 0).astype(jnp.uint8))
         fixed = (None, room, form, None, None, update)
-        return NeighborList(idx, position, error, *fixed, kept=kept, occupancy=held, exact=exact)
+        chosen = {"occupancy": held, "measured_in": _matrix_of(kwargs.get("box", jnp.nan), position), "exact": exact}
+        return NeighborList(idx, position, error, *fixed, kept=kept, **chosen)
 
     def update(position: Array, neighbors: NeighborList, **kwargs: Given) -> NeighborList:
         if "box" in kwargs and not (fractional_coordinates or disable_cell_list):
@@ -175,9 +182,11 @@ def neighbor_list(
             raise TypeError(f"update() got {', '.join(_DEFORM & kwargs.keys())}, with which the list was not allocated.")
         new = None if kept is None else kept.update(position, box=present)
         moved = new.rebuild_count != kept.rebuild_count if new is not None and kept is not None and skin else jnp.asarray(False)
+        measured_in = _matrix_of(kwargs.get("box", jnp.nan), position)
         if not exact:
             away = jax.vmap(functools.partial(squared, **kwargs))(position, neighbors.reference_position)
-            moved = moved | jnp.asarray("box" in kwargs) | ~(away <= (skin / 2) ** 2).all()
+            resized = ~jnp.array_equal(measured_in, neighbors.measured_in, equal_nan=True)
+            moved = moved | resized | ~(away <= (skin / 2) ** 2).all()
 
         def rebuild() -> tuple[Array, ...]:
             return *finish(rows_of(position, new, exact, kwargs), room, exact), position
@@ -189,7 +198,8 @@ def neighbor_list(
         code = neighbors.error.code | jnp.where(held > room, 1, 0).astype(jnp.uint8)
         code = code if new is None else code | _code_of(new.status)
         error, held = partition.PartitionError(code), jnp.maximum(held, neighbors.occupancy)
-        return dataclasses.replace(neighbors, idx=idx, reference_position=reference, error=error, kept=new, occupancy=held)
+        now = {"reference_position": reference, "error": error, "kept": new, "occupancy": held, "measured_in": measured_in}
+        return dataclasses.replace(neighbors, idx=idx, **now)
 
     return partition.NeighborListFns(allocate, update)
 
@@ -203,6 +213,13 @@ def _code_of(status: Array) -> Array:
     others = (status & ~Status.BOX_TOO_SMALL.value) != 0
     codes = partition.PartitionErrorCode.CELL_SIZE_TOO_SMALL, partition.PartitionErrorCode.NEIGHBOR_LIST_OVERFLOW
     return jnp.where(shrunk, codes[0].value, 0).astype(jnp.uint8) | jnp.where(others, codes[1].value, 0).astype(jnp.uint8)
+
+
+def _matrix_of(box: Given, position: Array) -> Array:
+    """Return the matrix of a box in any form, [d, d]."""
+    dim = position.shape[1]
+    matrix = jnp.asarray(box, position.dtype if position.dtype.itemsize > 2 else np.float32)
+    return matrix if matrix.ndim == 2 else jnp.where(jnp.eye(dim, dtype=bool), matrix, 0 * matrix)
 
 
 def _box_of(space: Space, dim: int) -> Box | None:

@@ -199,53 +199,84 @@ def flat_edges(
     return Edges(senders, flat.rows, displacement, shift, real, status, distance, flat.offsets[-1])
 
 
+Ends = tuple[Topology, Topology, Array]  # senders, receivers, and the number of pairs, true or missing some
+Where = tuple[Array, Array, Box | None, Batch | None]  # sources, rows, the box and the systems
+
+
+class _EdgePairs(NamedTuple):
+    """The edges of a flat list at present positions.
+
+    Attributes:
+        vectors: x_j - x_i with the translation of its image, [total, 1, d].
+        mask: Whether an edge is a pair that is closer than the cutoff, [total].
+        whole: Lattice shifts between near points, [total, 1, d] whole floats; None in open space.
+        shift: Lattice shifts between points as they are given, [total, d] int32.
+    """
+
+    vectors: Array
+    mask: Array
+    whole: Array | None
+    shift: Array
+
+
 @functools.partial(compile_program, static_argnames=("kind", "closed", "half"))
 def edges_of(
-    ends: tuple[Topology, Topology, Array],
+    ends: Ends,
     status: Array,
     images: ImagesMade,
-    sources: Array,
-    rows: Array,
-    box: Box | None,
-    batch: Batch | None,
+    where: Where,
     cutoff: Cutoff | Radii | None,
     kind: Images | None,
     closed: bool,
     half: bool,
 ) -> Edges:
-    """Return the edges of a flat list: `ends` are its senders, its receivers and the number of pairs, true or missing some.
-
-    Without a cutoff, all of its pairs are edges.
-    """
-    from jfrnn._search.gathers import gather
-
+    """Return the edges of a flat list; without a cutoff, all of its pairs are edges."""
     by_sender, by_receiver, pair_count = ends
-    total, senders, receivers = len(by_sender.idx), by_sender.idx[:, 0], by_receiver.idx[:, 0]
-    missing, mask, near = pair_count > total, lax.iota(jnp.int32, total) < pair_count, None
-    if box is not None and kind is not None:
-        near = find_ends(sources, rows, box, kind, batch, by_sender.native)
-        sources, rows = near.sources.points, near.rows.points
-    at_senders, at_receivers = gather(sources, by_sender), gather(rows, by_receiver)
-    vectors, pairs, shift = at_senders - at_receivers, None, jnp.zeros((total, sources.shape[1]), jnp.int32)
-    if near is not None and box is not None and kind is not None:
-        systems = None if batch is None else batch.of_queries.at[receivers].get(mode="clip")
-        lattice = lattice_of_rows(box, kind, np.dtype(sources.dtype), systems, by_sender.native)
-        shifts = edge_shifts(vectors, mask, (by_sender, by_receiver), images, near, lattice)
-        if half and kind.counts_short:  # as in padded lists
-            shifts = jnp.where((senders == receivers)[:, None, None], forward_shifts(shifts, lattice), shifts)
-        shifts = jnp.where(mask[:, None, None], shifts, 0)
-        pairs = shift_pairs(vectors, shifts, lattice)
-        vectors, shift = pairs.vectors, near._replace(of_rows=lattice).shifts_of_given(shifts[:, 0], senders, receivers)
-        shift = jnp.where(mask[:, None], shift, 0)
-    if cutoff is not None:
-        mask = mask & _are_close(by_sender, by_receiver, mask, sources, at_receivers, cutoff, closed, pairs)
-        shift = jnp.where(mask[:, None], shift, 0)
-    displacement = jnp.where(mask[:, None], vectors[:, 0], 0).astype(sources.dtype)
+    vectors, mask, _, shift = _edge_pairs(ends, images, where, cutoff, kind, closed, half)
+    missing, shift = pair_count > len(mask), jnp.where(mask[:, None], shift, 0)
+    displacement = jnp.where(mask[:, None], vectors[:, 0], 0).astype(where[0].dtype)
     known = are_whole(status, Status.NONFINITE) & ~missing
     displacement, shift, distance = (mark_rows(x, known) for x in (displacement, shift, norms(displacement)))
     status = status | jnp.where(missing, jnp.int32(Status.TOTAL_OVERFLOW.value), 0)
     held = pair_count if cutoff is None else jnp.where(missing, pair_count, jnp.sum(mask, dtype=jnp.int32))
-    return Edges(senders, receivers, displacement, shift, mask, status, distance, held)
+    return Edges(by_sender.idx[:, 0], by_receiver.idx[:, 0], displacement, shift, mask, status, distance, held)
+
+
+@functools.partial(compile_program, static_argnames=("kind", "closed", "half"))
+def close_edges(
+    ends: Ends, images: ImagesMade, where: Where, cutoff: Cutoff | Radii | None, kind: Images | None, closed: bool, half: bool
+) -> tuple[Array, Array | None]:
+    """Say which edges are pairs [total]; and return their shifts between near points, [total, d] whole floats, in a box."""
+    _, mask, whole, _ = _edge_pairs(ends, images, where, cutoff, kind, closed, half)
+    return mask, None if whole is None else whole[:, 0]
+
+
+def _edge_pairs(
+    ends: Ends, images: ImagesMade, where: Where, cutoff: Cutoff | Radii | None, kind: Images | None, closed: bool, half: bool
+) -> _EdgePairs:
+    from jfrnn._search.gathers import gather
+
+    (by_sender, by_receiver, pair_count), (sources, rows, box, batch) = ends, where
+    total, senders, receivers = len(by_sender.idx), by_sender.idx[:, 0], by_receiver.idx[:, 0]
+    mask, near = lax.iota(jnp.int32, total) < pair_count, None
+    if box is not None and kind is not None:
+        near = find_ends(sources, rows, box, kind, batch, by_sender.native)
+        sources, rows = near.sources.points, near.rows.points
+    at_senders, at_receivers = gather(sources, by_sender), gather(rows, by_receiver)
+    vectors, pairs, whole = at_senders - at_receivers, None, None
+    shift = jnp.zeros((total, sources.shape[1]), jnp.int32)
+    if near is not None and box is not None and kind is not None:
+        systems = None if batch is None else batch.of_queries.at[receivers].get(mode="clip")
+        lattice = lattice_of_rows(box, kind, np.dtype(sources.dtype), systems, by_sender.native)
+        whole = edge_shifts(vectors, mask, (by_sender, by_receiver), images, near, lattice)
+        if half and kind.counts_short:  # as in padded lists
+            whole = jnp.where((senders == receivers)[:, None, None], forward_shifts(whole, lattice), whole)
+        whole = jnp.where(mask[:, None, None], whole, 0)
+        pairs = shift_pairs(vectors, whole, lattice)
+        vectors, shift = pairs.vectors, near._replace(of_rows=lattice).shifts_of_given(whole[:, 0], senders, receivers)
+    if cutoff is not None:
+        mask = mask & _are_close(by_sender, by_receiver, mask, sources, at_receivers, cutoff, closed, pairs)
+    return _EdgePairs(vectors, mask, whole, shift)
 
 
 def _are_close(

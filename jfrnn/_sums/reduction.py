@@ -32,10 +32,10 @@ from jfrnn._geometry import (
     one_or_nan,
     translation,
 )
-from jfrnn._search import MOST_SLOTS, NeighborList, Problem, find_ends, is_native, kept_list, lattice_of_rows
+from jfrnn._search import MOST_SLOTS, EdgeList, NeighborList, Problem, find_ends, is_native, kept_list, lattice_of_rows
 from jfrnn._sums.extremes import bind_extremes
 from jfrnn._sums.pair_function import call_with_pair
-from jfrnn._sums.relations import Kept, Listed, Relation, Searched
+from jfrnn._sums.relations import Flat, Kept, Listed, Relation, Searched
 from jfrnn._sums.summation import bind_sum
 from jfrnn._sums.terms import OF_QUERIES, OF_SOURCES, Groups, Labels, Summand, Term, choose, fresh_labels, trace
 from jfrnn._tracing import Given, Points, Tree, call_apart, compile_program, on_device
@@ -84,7 +84,7 @@ def pairs_of_search(problem: Problem, inputs: Inputs, summed: bool) -> Pairs:
 
 
 def pairs_of_list(
-    nbrs: NeighborList,
+    nbrs: NeighborList | EdgeList,
     positions: Points,
     cutoff: Given,
     queries: Points | None,
@@ -93,8 +93,8 @@ def pairs_of_list(
     full: bool,
 ) -> Pairs:
     """Return the pairs of a list, after checking that no argument in `given` contradicts it; `full` refuses half lists."""
-    if not isinstance(nbrs, NeighborList):
-        raise TypeError(f"neighbors must be a jfrnn.NeighborList, got {type(nbrs).__name__}.")
+    if not isinstance(nbrs, NeighborList | EdgeList):
+        raise TypeError(f"neighbors must be a jfrnn.NeighborList or a jfrnn.EdgeList, got {type(nbrs).__name__}.")
     for name in (name for name, is_given in given.items() if is_given):
         raise ValueError(f"{name} was said when the list was made: leave it out where neighbors is given.")
     if full and nbrs.half:
@@ -116,13 +116,19 @@ def pairs_of_list(
     rows = sources if asking is None else asking
     largest = nbrs.cutoff if nbrs.radii is None else make_cutoffs(lax.stop_gradient(nbrs.radii), nbrs.closed).largest
     masked = nbrs.masked or (nbrs.box is not None and nbrs.box.per_system)
-    data = nbrs.status, nbrs.count if masked and not own else None, fixed_rows
-    sources, rows, mark = _prepare_marks(sources, rows if own else None, _good_rows_of_list, data)
+    held = (nbrs.count if isinstance(nbrs, NeighborList) else jnp.diff(nbrs.offsets)) if masked and not own else None
+    data, harmless = (nbrs.status, held, fixed_rows), (nbrs._harmless,)
+    sources, rows, mark = _prepare_marks(sources, rows if own else None, _good_rows_of_list, data, harmless)
     return Pairs(relation, nbrs.half, sources, rows, lattice, largest, directionless, mark)
 
 
-def _relation_of_list(nbrs: NeighborList, sources: Array, rows: Array, box: Box | None, symmetric: bool) -> Kept | Listed:
-    """Return the pairs of a list: Warp's kernels decide about them while they sum, or all is decided at once."""
+def _relation_of_list(
+    nbrs: NeighborList | EdgeList, sources: Array, rows: Array, box: Box | None, symmetric: bool
+) -> Kept | Listed | Flat:
+    """Return the pairs of a list: of padded ones Warp's kernels decide while they sum; else all is decided at once."""
+    if isinstance(nbrs, EdgeList):
+        mask, shifts = nbrs._close_edges(sources, rows, box)
+        return Flat(nbrs.senders, nbrs.receivers, nbrs.offsets, mask, shifts, nbrs.source_count, symmetric)
     topology, nobody = nbrs._topology(), 0 in (*nbrs.idx.shape, nbrs.source_count)
     if nobody or not is_native(topology, nbrs.box_kind, nbrs.half) or nbrs.idx.size > MOST_SLOTS:
         _, mask, shifts = nbrs._geometry_of(sources, rows, box)
@@ -146,11 +152,11 @@ def _good_rows_of_search(inputs: Inputs, options: Options, doubtful: bool) -> Ar
     return good_rows(*rows_asked(inputs), are_whole(find_bits(inputs, options)) if doubtful else None)
 
 
-@compile_program
-def _good_rows_of_list(status: Array, count: Array | None, points: Array) -> Array:
+@functools.partial(compile_program, static_argnames=("harmless",))
+def _good_rows_of_list(status: Array, count: Array | None, points: Array, harmless: Status) -> Array:
     """Say which rows [m] of a list are valid. If particles may be inactive, `count` is given: those with neighbors are active."""
     active = None if count is None else (count > 0) | ((status & Status.NONFINITE.value) != 0)
-    return good_rows(points, active, are_whole(status))
+    return good_rows(points, active, are_whole(status, harmless))
 
 
 def _prepare_marks(
@@ -242,15 +248,9 @@ def reduce_pairs(
 
 
 @functools.partial(compile_program, static_argnames=("term", "compensated"))
-def _sums_of_half(listed: Listed | Kept, term: Term, operands: Groups, compensated: bool) -> list[Array]:
+def _sums_of_half(listed: Listed | Flat | Kept, term: Term, operands: Groups, compensated: bool) -> list[Array]:
     """Sum over a half list and over its mirror image; a particle's pair with itself counts once."""
-    if isinstance(listed, Kept):
-        both = listed, dataclasses.replace(listed, apart=True, flipped=True)
-        return [x + y for x, y in zip(*(bind_sum(each, term, operands, compensated) for each in both), strict=True)]
-    apart = listed.idx != lax.iota(jnp.int32, listed.idx.shape[0])[:, None]
-    apart = apart if listed.shifts is None else apart | (listed.shifts != 0).any(axis=-1)
-    mirrored = dataclasses.replace(listed, mask=listed.mask & apart, flipped=True)
-    parts = (bind_sum(relation, term, operands, compensated) for relation in (listed, mirrored))
+    parts = (bind_sum(relation, term, operands, compensated) for relation in (listed, listed.mirrored()))
     return [x + y for x, y in zip(*parts, strict=True)]
 
 

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
-from typing import TypeGuard
+from typing import Any, ClassVar, Self, TypeGuard
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +15,7 @@ from jfrnn._sums.fused import is_fused as is_fusible
 from jfrnn._sums.fused import sums as fused_sums
 from jfrnn._sums.fused import sums_of_list
 from jfrnn._sums.terms import Groups, Term
-from jfrnn._tracing import Tree
+from jfrnn._tracing import Tree, largest_of
 
 _LIST_SLOTS = 1 << 22  # scalars of list slots that are processed at a time: 16 MB of float32
 
@@ -72,10 +72,88 @@ class Searched:
         return fold_pairs(self.inputs, self.options, elements, visit, out)
 
 
+class _OfList:
+    """What the pairs of padded and flat lists have in common."""
+
+    __dataclass_fields__: ClassVar[dict[str, Any]]
+    mask: Array
+    shifts: Array | None
+    source_count: int
+    symmetric: bool
+    flipped: bool
+
+    @property
+    def periodic(self) -> bool:
+        """Whether pairs have lattice shifts."""
+        return self.shifts is not None
+
+    @property
+    def sizes(self) -> tuple[int, int]:
+        """Number of rows and of sources; exchanged if flipped."""
+        m, n = self._row_count, self.source_count
+        return (n, m) if self.flipped else (m, n)
+
+    def reverse(self) -> Self:
+        """Return the same pairs with i and j exchanged and shifts negated."""
+        return self if self.symmetric else dataclasses.replace(self, flipped=not self.flipped)
+
+    def mirrored(self) -> Self:
+        """Return them so, without those of a particle with itself."""
+        apart = self._are_apart()
+        apart = apart if self.shifts is None else apart | (self.shifts != 0).any(axis=-1)
+        return dataclasses.replace(self, mask=self.mask & apart, flipped=True)
+
+    def fold(self, elements: int, visit: Visit, out: Tree) -> Tree:
+        """Visit all pairs in blocks of rows, as `fold_neighbors` does."""
+        m, group = self._row_count, min(FOLD_GROUP, self._widest)
+        if 0 in (m, group, self.source_count):
+            return out
+        size = min(max(_LIST_SLOTS // (group * elements), 1), m)
+
+        def fold_block(b: Array, out: Tree) -> Tree:
+            row = jnp.minimum(b * size, m - size) + lax.iota(jnp.int32, size)
+            fresh = row >= b * size
+
+            def fold(add: Callable[[Slots, Tree], Tree], state: Tree) -> Tree:
+                longest = self._longest(row)
+
+                def add_group(g: Array, state: Tree) -> Tree:
+                    idx, shift, real = self._slots(row, g * group, group)
+                    real = real & fresh[:, None]
+                    return add(Slots(jnp.where(real, idx, 0), shift, real), state)
+
+                return lax.fori_loop(0, (longest + (group - 1)) // group, add_group, state)
+
+            return visit(Block(row, fresh, fold), out)
+
+        return lax.fori_loop(0, -(-m // size), fold_block, out)
+
+    @property
+    def _row_count(self) -> int:
+        raise NotImplementedError
+
+    @property
+    def _widest(self) -> int:
+        """The most pairs that a row may have."""
+        raise NotImplementedError
+
+    def _longest(self, rows: Array) -> Array | int:
+        """Return a length that none of these rows exceeds."""
+        raise NotImplementedError
+
+    def _slots(self, rows: Array, start: Array, group: int) -> tuple[Array, Array | None, Array]:
+        """Return sources, shifts and mask, [rows, group, ...], of `group` slots of consecutive rows, from `start` on."""
+        raise NotImplementedError
+
+    def _are_apart(self) -> Array:
+        """Say which slots hold another particle than their row."""
+        raise NotImplementedError
+
+
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
-class Listed:
-    """The pairs of a list.
+class Listed(_OfList):
+    """The pairs of a padded list.
 
     Attributes:
         idx: [m, c] int32 source indices, valid where `mask` is set.
@@ -94,49 +172,73 @@ class Listed:
     flipped: bool = dataclasses.field(default=False, metadata={"static": True})
 
     @property
-    def periodic(self) -> bool:
-        """Whether pairs have lattice shifts."""
-        return self.shifts is not None
+    def _row_count(self) -> int:
+        return self.idx.shape[0]
 
     @property
-    def sizes(self) -> tuple[int, int]:
-        """Number of rows and of sources; exchanged if flipped."""
-        m, n = self.idx.shape[0], self.source_count
-        return (n, m) if self.flipped else (m, n)
+    def _widest(self) -> int:
+        return self.idx.shape[1]
 
-    def reverse(self) -> "Listed":
-        """Return the same pairs with i and j exchanged and shifts negated."""
-        return self if self.symmetric else dataclasses.replace(self, flipped=not self.flipped)
+    def _longest(self, rows: Array) -> int:
+        return self._widest
 
-    def fold(self, elements: int, visit: Visit, out: Tree) -> Tree:
-        """Visit all pairs in blocks of rows, as `fold_neighbors` does."""
-        m, capacity = self.idx.shape
-        if 0 in (m, capacity, self.source_count):
-            return out
-        group = min(FOLD_GROUP, capacity)
-        size = min(max(_LIST_SLOTS // (group * elements), 1), m)
+    def _slots(self, rows: Array, start: Array, group: int) -> tuple[Array, Array | None, Array]:
+        first = jnp.minimum(start, self._widest - group).astype(rows.dtype)
+        new = first + lax.iota(jnp.int32, group) >= start
 
-        def fold_block(b: Array, out: Tree) -> Tree:
-            first = jnp.minimum(b * size, m - size)
-            row = first + lax.iota(jnp.int32, size)
-            fresh = row >= b * size
+        def cut(x: Array) -> Array:
+            origin = (rows[0], first, *[jnp.zeros_like(first)] * (x.ndim - 2))
+            return lax.dynamic_slice(x, origin, (len(rows), group, *x.shape[2:]))
 
-            def fold(add: Callable[[Slots, Tree], Tree], state: Tree) -> Tree:
-                def add_group(g: Array, state: Tree) -> Tree:
-                    start = jnp.minimum(g * group, capacity - group)
-                    new = start + lax.iota(jnp.int32, group) >= g * group
-                    idx, mask = (lax.dynamic_slice(x, (first, start), (size, group)) for x in (self.idx, self.mask))
-                    zero = jnp.zeros_like(first)
-                    shift = self.shifts
-                    shift = None if shift is None else lax.dynamic_slice(shift, (first, start, zero), (size, group, shift.shape[2]))
-                    real = mask & new[None] & fresh[:, None]
-                    return add(Slots(jnp.where(real, idx, 0), shift, real), state)
+        return cut(self.idx), None if self.shifts is None else cut(self.shifts), cut(self.mask) & new
 
-                return lax.fori_loop(0, -(-capacity // group), add_group, state)
+    def _are_apart(self) -> Array:
+        return self.idx != lax.iota(jnp.int32, self.idx.shape[0])[:, None]
 
-            return visit(Block(row, fresh, fold), out)
 
-        return lax.fori_loop(0, -(-m // size), fold_block, out)
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Flat(_OfList):
+    """The pairs of a flat list.
+
+    Attributes:
+        senders: [total] int32 source indices, valid where `mask` is set.
+        receivers: [total] int32, their rows, ascending.
+        offsets: [m + 1] int32, where the pairs of each row begin, and those of the last one end; they may exceed `total`.
+        mask: [total] bool, which of them are pairs.
+        shifts: [total, d] whole floats, or None in open space.
+        source_count: As in `Listed`, and so are symmetric and flipped. Static.
+    """
+
+    senders: Array
+    receivers: Array
+    offsets: Array
+    mask: Array
+    shifts: Array | None
+    source_count: int = dataclasses.field(metadata={"static": True})
+    symmetric: bool = dataclasses.field(metadata={"static": True})
+    flipped: bool = dataclasses.field(default=False, metadata={"static": True})
+
+    @property
+    def _row_count(self) -> int:
+        return self.offsets.shape[0] - 1
+
+    @property
+    def _widest(self) -> int:
+        return self.senders.shape[0]
+
+    def _longest(self, rows: Array) -> Array:
+        ends = jnp.minimum(self.offsets, self._widest)
+        return largest_of(ends[rows + 1] - ends[rows])
+
+    def _slots(self, rows: Array, start: Array, group: int) -> tuple[Array, Array | None, Array]:
+        edge = self.offsets[rows, None] + (start + lax.iota(jnp.int32, group))
+        there = edge < jnp.minimum(self.offsets[rows + 1, None], self._widest)
+        edge = jnp.where(there, edge, 0)
+        return self.senders[edge], None if self.shifts is None else self.shifts[edge], self.mask[edge] & there
+
+    def _are_apart(self) -> Array:
+        return self.senders != self.receivers
 
 
 @jax.tree_util.register_dataclass
@@ -173,14 +275,16 @@ class Kept:
         """Return the same pairs with i and j exchanged and shifts negated."""
         return self if self.symmetric else dataclasses.replace(self, flipped=not self.flipped)
 
+    def mirrored(self) -> "Kept":
+        """Return them so, without those of a particle with itself."""
+        return dataclasses.replace(self, apart=True, flipped=True)
+
     def listed(self) -> Listed:
         """Return the same pairs, decided at once, for array programming."""
         given, n = self.given, self.given.sources.shape[0]
         mask, shifts = kept_mask(given), kept_shifts(given) if self.periodic else None
-        if self.apart:
-            apart = given.idx != lax.iota(jnp.int32, given.idx.shape[0])[:, None]
-            mask = mask & (apart if shifts is None else apart | (shifts != 0).any(axis=-1))
-        return Listed(given.idx, mask, shifts, n, self.symmetric, self.flipped)
+        listed = Listed(given.idx, mask, shifts, n, self.symmetric, self.flipped)
+        return dataclasses.replace(listed.mirrored(), flipped=self.flipped) if self.apart else listed
 
     def directed(self) -> KeptList:
         """Return the list, with the slots of each source if i and j are exchanged."""
@@ -193,7 +297,7 @@ class Kept:
         return given._replace(reversal=(found.slots, found.starts, found.lengths))
 
 
-Relation = Searched | Listed | Kept
+Relation = Searched | Listed | Flat | Kept
 
 
 def is_fused(relation: Relation, term: Term) -> TypeGuard[Searched]:
@@ -263,7 +367,7 @@ def sum_pairs(relation: Relation, term: Term, operands: Groups, compensated: boo
     return [mark_rows(x, good) if mark else x for x, mark in zip(results, term.marks, strict=True)]
 
 
-def evaluate(relation: Searched | Listed, term: Term, operands: Groups, block: Block, slots: Slots) -> list[Array]:
+def evaluate(relation: Searched | Listed | Flat, term: Term, operands: Groups, block: Block, slots: Slots) -> list[Array]:
     """Evaluate a term on slots [b, g] of a block: [b, g, ...], 0 in masked slots."""
     mine, theirs = (operands.others, operands.own) if relation.flipped else (operands.own, operands.others)
     of_query, of_source = tuple(x[block.query] for x in mine), tuple(x[slots.source] for x in theirs)

@@ -10,7 +10,7 @@ from jax.tree_util import KeyPath
 
 from jfrnn._engine import ARRAYS, ENGINES, Inputs, Kind, Options, parse_backend, platform_of
 from jfrnn._geometry import Box, check_flag
-from jfrnn._search import NeighborList, check_problem
+from jfrnn._search import EdgeList, NeighborList, check_problem
 from jfrnn._tracing import (
     AnyCutoff,
     Backend,
@@ -52,7 +52,7 @@ def pair_sum(
     active: Flags | None = None,
     compensated: Flag = False,
     backend: Backend = "auto",
-    neighbors: NeighborList | None = None,
+    neighbors: NeighborList | EdgeList | None = None,
 ) -> Sums:
     """Sum a function of pairs over the neighbors of each particle, without a neighbor list; differentiable to every order.
 
@@ -81,7 +81,7 @@ def pair_sum(
         active: As in `search`.
         compensated: Carry the rounding errors of the sums along (two-sum, Knuth 1969), also in derivatives.
         backend: "warp" (fn becomes part of the kernel that finds the pairs), "jax" (any device), "brute", or "auto".
-        neighbors: A list to use instead of a search: its pairs that are closer than the cutoff at these positions.
+        neighbors: A padded or flat list to use instead of a search: its pairs that are closer than the cutoff at these positions.
 
     Returns:
         A pytree as fn returns it, leaves [m, ...]. Invalid rows (NaN or infinite coordinates; inside jit all rows, if pairs may be

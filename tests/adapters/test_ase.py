@@ -5,6 +5,8 @@ import importlib
 import itertools
 import subprocess
 import sys
+import tomllib
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -16,6 +18,8 @@ import jfrnn.matscipy
 import jfrnn.vesin
 from jfrnn.ase import neighbor_list, primitive_neighbor_list
 from jfrnn.cases.periodic import PERIODIC_CASES
+
+ROOT = Path(__file__).parents[2]
 
 
 def as_set(i, j, s):
@@ -162,6 +166,9 @@ BAD = {
     r"cutoff must be a number, a dictionary, or radii of shape \[2\]": {"cutoff": np.ones(3)},
     "cutoff must be finite and at least 0": {"cutoff": -1.0},
     "cutoff must be finite and at least 0, got inf for": {"cutoff": {(1, 1): np.inf}, "numbers": [1, 1]},
+    r"cutoff must be a number \[length\], a dictionary of numbers, or radii of all atoms, got str": {"cutoff": "3"},
+    r"cutoff must be a number \[length\] for \(1, 1\), got str": {"cutoff": {(1, 1): "2"}, "numbers": [1, 1]},
+    r"cutoff must be a number \[length\] for \('H', 6\), got shape \[1\]": {"cutoff": {("H", 6): [2.0]}, "numbers": [1, 1]},
     "keys of cutoff must be pairs of symbols or numbers": {"cutoff": {("H", "Q"): 1.0}, "numbers": [1, 1]},
     "cutoff must not be a defaultdict of 2.0 with other values": {"cutoff": collections.defaultdict(lambda: 2.0, {(1, 1): 1.0})},
     "a dictionary of cutoffs needs numbers": {"cutoff": {(1, 1): 1.0}},
@@ -182,10 +189,36 @@ def test_what_is_no_structure_is_refused():
         neighbor_list("ij", np.zeros((2, 3)), 1.0)
 
 
-def test_it_takes_no_device_of_jax():
-    code = "import jax, numpy as np; from jfrnn.ase import primitive_neighbor_list as find; find('i', True, np.eye(3), "
-    code += "np.zeros((1, 3)), 2.0); assert not jax._src.xla_bridge.backends_are_initialized()"
-    subprocess.run([sys.executable, "-c", code], check=True)
+PLUGIN = """
+import sys, types
+from importlib.metadata import EntryPoint
+
+class Plugin:
+    def __init__(self, name, **given):
+        vars(self).update(name=name, module=None, **given)
+
+ase4 = types.SimpleNamespace(NeighborListPlugin=Plugin)
+names = ["ase", "ase._4", "ase._4.plugins", "ase._4.plugins.neighborlist"]
+sys.modules |= dict.fromkeys(names, ase4)
+[plugin] = EntryPoint("jfrnn", %r, "ase.plugins").load().__ase_plugins__
+assert not {"jax", "jfrnn", "numpy"} & sys.modules.keys()
+for name in names:
+    del sys.modules[name]
+import jfrnn.ase
+path, _, function = plugin.implementation.rpartition(".")
+assert getattr(sys.modules[path], function) is jfrnn.ase.neighbor_list
+assert (plugin.name, plugin.module.__name__) == ("jfrnn", "jfrnn")
+
+import jax, numpy as np
+jfrnn.ase.primitive_neighbor_list("i", True, np.eye(3), np.zeros((1, 3)), 2.0)
+assert not jax._src.xla_bridge.backends_are_initialized()
+"""
+
+
+def test_it_takes_no_device_of_jax_and_its_plugin_no_module():
+    """ASE imports the plugin whenever it collects plugins; of its released versions, 3.29 has no `NeighborListPlugin` yet."""
+    entries = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["entry-points"]["ase.plugins"]
+    subprocess.run([sys.executable, "-c", PLUGIN % entries["jfrnn"]], check=True, cwd=ROOT)
 
 
 @pytest.mark.parametrize("bothways", [True, False])
@@ -286,6 +319,8 @@ def test_forms_of_matscipy_and_vesin():
     }
     with pytest.raises(ValueError, match="quantities must be letters of 'ijPSDd'"):
         jfrnn.vesin.NeighborList(cutoff=2.0, full_list=True).compute(x, cell, True, "x")
+    with pytest.raises(TypeError, match=r"cutoff must be a number \[length\], got list"):
+        jfrnn.vesin.NeighborList(cutoff=["a"], full_list=True)
     with pytest.raises(ValueError, match="algorithm must be"):
         jfrnn.vesin.NeighborList(cutoff=2.0, full_list=True, algorithm="tree")
 

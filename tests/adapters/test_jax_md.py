@@ -197,8 +197,12 @@ def test_boxes_of_lists_that_are_measured():
     assert pairs_of(nbrs.idx, N, jax_md.Dense) == expected(x, "fractional", jax_md.Dense)
     box = 1.1 * MATRIX
     near = reference.reference_images(x @ box.T, CUTOFF + SKIN, matrix=box.T, periodic=(True,) * 3)
-    wide = jax.jit(lambda x, nbrs, box: nbrs.update(x, box=box, neighbor=nbrs))(x, nbrs, box)
+    update = jax.jit(lambda x, nbrs, box: nbrs.update(x, box=box, neighbor=nbrs))
+    wide = update(x, nbrs, box)
     assert pairs_of(wide.idx, N, jax_md.Dense) == {(i, j) for i, j, _ in near}
+    still = update(x + 0.001, wide, box)  # a box that is still the same is none to measure in again
+    np.testing.assert_array_equal(still.reference_position, x)
+    assert (np.asarray(update(x, still, 0.9 * box).idx) < N).sum() > len(near)
 
 
 EDGE, SHEAR = 3.0, np.array([[1.0, 0.001, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
@@ -225,11 +229,12 @@ def cubic(a, b, xp=jnp):  # no Euclidean distance: pairs are as far apart as the
 
 @pytest.mark.parametrize("displacement", [sheared, longer, bumped, cubic])
 def test_the_function_chooses(displacement):
-    """Also where it is nearly, but not everywhere, the nearest image in `box`."""
+    """Also where it is nearly, but not everywhere, the nearest image in `box`; and about particles with themselves."""
     x = np.random.default_rng(4).random((400, 3)) * EDGE
     away = np.linalg.norm(displacement(x[:, None], x, np), axis=2)
-    near = {(i, j) for i, j in zip(*np.nonzero(away < CUTOFF)) if i != j}
-    nbrs = jax_md.neighbor_list(jax.jit(displacement), EDGE, CUTOFF).allocate(x)
+    apart = displacement is not cubic
+    near = {(i, j) for i, j in zip(*np.nonzero(away < CUTOFF)) if i != j or not apart}
+    nbrs = jax_md.neighbor_list(jax.jit(displacement), EDGE, CUTOFF, mask_self=apart).allocate(x)
     assert nbrs.kept is not None
     assert pairs_of(nbrs.idx, 400, jax_md.Dense) == near
 

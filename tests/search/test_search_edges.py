@@ -59,8 +59,8 @@ def assert_right(nbrs, x, expected, queries=None):
     ("backend", "box"),
     [
         ("warp", "images"),
-        ("brute", "open"),
-        *(pytest.param(*case, marks=SLOW) for case in (("warp", "open"), ("warp", "nearest"), ("brute", "images"))),
+        *(pytest.param("brute", box, marks=SLOW) for box in ("open", "images")),
+        *(pytest.param("warp", box, marks=SLOW) for box in ("open", "nearest")),
         *(pytest.param("jax", box, marks=SLOW) for box in LENGTHS),
     ],
 )
@@ -178,6 +178,44 @@ def test_geometry_and_derivatives_are_those_of_padded_lists(half, box, reverse):
     assert edges_as_set(flat.edges(moved)) == edges_as_set(padded.edges(moved, total))
 
 
+@pytest.mark.parametrize("half", [True, pytest.param(False, marks=SLOW)])
+def test_sums_are_those_of_numpy(half):
+    """Over the pairs of a flat list at positions of now and at a shorter cutoff, with derivatives in positions, values and box."""
+    x, lengths = points(30, "images", dtype=np.float64), np.array(LENGTHS["images"])
+    m, w = np.linspace(1, 2, 30), np.arange(30.0)
+    nbrs = jfrnn.search_edges(x, 0.4, box=jfrnn.Box(lengths), skin=0.02, half=half, total=3000, backend="brute")
+    nbrs.check()
+    x, cutoff = x + 0.005 * np.sin(40 * x), 0.35
+
+    @jax.jit
+    def all_of(x, m, lengths, nbrs):
+        def f(x, m, lengths):
+            fn = lambda r, i, j: i * j**2 * (r**3).sum()  # noqa: E731
+            return w @ jfrnn.pair_sum(fn, x, cutoff, m, neighbors=nbrs, box=jfrnn.Box(lengths))
+
+        return jax.value_and_grad(f, (0, 1, 2))(x, m, lengths)
+
+    pairs = reference.reference_images(x, cutoff, matrix=lengths, periodic=(True,) * 3)
+    found = np.array([(i, j, *shift) for i, j, shift in pairs])
+    i, j, shift = found[:, 0], found[:, 1], found[:, 2:]
+    assert (i == j).any()
+    r = x[j] - x[i] + shift * lengths
+    each, pull = w[i] * m[i] * m[j] ** 2, 3 * (w[i] * m[i] * m[j] ** 2)[:, None] * r**2
+    cubes, slopes = (r**3).sum(1), [np.zeros((30, 3)), np.zeros(30), (pull * shift).sum(0)]
+    for k, sign in ((j, 1), (i, -1)):
+        np.add.at(slopes[0], k, sign * pull)
+    np.add.at(slopes[1], i, each / m[i] * cubes)
+    np.add.at(slopes[1], j, 2 * each / m[j] * cubes)
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, b, atol=1e-12 * np.abs(b).max()),
+        all_of(x, m, lengths, nbrs),
+        (each @ cubes, tuple(slopes)),
+    )
+    if half:
+        with pytest.raises(ValueError, match="must be a full list for reduce='max'"):
+            jfrnn.pair_sum(lambda r, i, j: r, x, None, neighbors=nbrs, reduce="max")
+
+
 def test_derivatives_do_not_scatter():
     x, options = points(dtype=np.float64), {"total": 2000, "reverse": True, "backend": "brute"}
     nbrs = jax.eval_shape(lambda x: jfrnn.search_edges(x, CUTOFF, **options), x)  # for which no program is compiled
@@ -269,7 +307,9 @@ def test_where_rows_begin_never_wraps():
     np.testing.assert_array_equal(jax.jit(add_up)(jnp.asarray(counts[:3])), exact[:4])
 
 
-@pytest.mark.parametrize(("backend", "include_self"), [("warp", False), pytest.param("warp", True, marks=SLOW), ("jax", False)])
+@pytest.mark.parametrize(
+    ("backend", "include_self"), [("warp", False), *(pytest.param(*each, marks=SLOW) for each in (("warp", True), ("jax", False)))]
+)
 def test_own_images_in_half_lists(backend, include_self):
     """They are listed once, and so counted, with and without a program, where both ends of a pair are one particle."""
     x, lengths = points(5), np.array([0.25, 0.25, 0.25])

@@ -40,7 +40,7 @@ def run(*arguments, cwd, python=sys.executable, **environment):
 
 def build_wheel(folder):
     """Build a wheel of a copy of the tree, without what an earlier build left, and without the internet."""
-    for name in ("jfrnn", "kernels", "cases", "pyproject.toml", "setup.py", "README.md", "LICENSE"):
+    for name in ("jfrnn", "jfrnn_ase_plugin.py", "kernels", "cases", "pyproject.toml", "setup.py", "README.md", "LICENSE"):
         (folder / "tree").mkdir(exist_ok=True)
         (folder / "tree" / name).symlink_to(ROOT / name)
     build = ("-m", "pip", "wheel", "--quiet", "--no-deps", "--no-build-isolation", "--wheel-dir", str(folder), str(folder / "tree"))
@@ -66,7 +66,7 @@ def test_wheel_works_elsewhere(wheel, tmp_path):
 
 def test_wheel_holds_the_library_alone(wheel):
     names = zipfile.ZipFile(wheel).namelist()
-    assert {name.split("/")[0] for name in names} == {"jfrnn", f"jfrnn-{jfrnn.__version__}.dist-info"}
+    assert {name.split("/")[0] for name in names} == {"jfrnn", "jfrnn_ase_plugin.py", f"jfrnn-{jfrnn.__version__}.dist-info"}
     assert {Path(name).suffix for name in names if not name.startswith("jfrnn-")} == {".py", ".typed", ".h", ".cuh"}
     held = {Path(name).name for name in names if "/native/" in name}
     assert held == {path.name for path in (ROOT / "kernels" / "native").iterdir() if path.suffix in (".py", ".h", ".cuh")}

@@ -151,9 +151,9 @@ def search_verb(verb):
     return run
 
 
-def sum_over(fn):
+def sum_over(fn, make=made):
     def run(bit, traced):
-        x, nbrs = made(bit, traced)
+        x, nbrs = make(bit, traced)
         return jfrnn.pair_sum(fn, x, None, neighbors=nbrs)
 
     return run
@@ -178,6 +178,7 @@ VERBS = dict(
         ("pair_sum, of integers", search_verb(functools.partial(jfrnn.pair_sum, whole))),
         ("pair_sum(neighbors=), of floats", sum_over(one)),
         ("pair_sum(neighbors=), of integers", sum_over(whole)),
+        ("pair_sum(neighbors=EdgeList)", sum_over(one, edges_made)),
         lists("NeighborList.vectors", lambda x, nbrs: nbrs.vectors(x)[0]),
         lists("NeighborList.distances", lambda x, nbrs: nbrs.distances(x)[0]),
         lists("NeighborList.shifts", lambda x, nbrs: nbrs.shifts(x)),
@@ -232,6 +233,7 @@ def full_lists(traced):
         "search_edges": flat,
         "pair_sum(neighbors=), of floats": lambda: jfrnn.pair_sum(one, X, None, neighbors=padded()),
         "pair_sum(neighbors=), of integers": lambda: jfrnn.pair_sum(whole, X, None, neighbors=padded()),
+        "pair_sum(neighbors=EdgeList)": lambda: jfrnn.pair_sum(one, X, None, neighbors=flat()),
         "NeighborList.vectors": lambda: padded().vectors(X)[0],
         "NeighborList.distances": lambda: padded().distances(X)[0],
         "NeighborList.shifts": lambda: jfrnn.search(X, CUTOFF, capacity=2, box=BOX).shifts(X),
