@@ -1,6 +1,7 @@
 """Crystals of different sizes from ASE, one compiled program: energies and forces.
 
 python examples/gallery/crystals.py [PICTURE]
+pip install -e '.[warp]' matplotlib ase
 """
 
 import sys

@@ -1,6 +1,7 @@
 """A dam break in 2D by smoothed particles, and a gradient through the run: the front over gravity.
 
 python examples/gallery/dam_break.py [PICTURE]
+pip install -e '.[warp]' matplotlib
 """
 
 import functools

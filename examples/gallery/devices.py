@@ -1,6 +1,7 @@
 """Particles on four devices, here virtual ones of a CPU, move from device to device in a time loop.
 
 XLA_FLAGS=--xla_force_host_platform_device_count=4 python examples/gallery/devices.py [PICTURE]
+pip install -e '.[warp]' matplotlib
 """
 
 import sys

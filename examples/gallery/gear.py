@@ -1,6 +1,7 @@
 """A jet of drops onto a turning gear: distances to a wall of triangles, in the frame of the gear.
 
 python examples/gallery/gear.py [PICTURE]
+pip install -e '.[warp]' matplotlib
 """
 
 import sys

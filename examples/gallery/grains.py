@@ -1,6 +1,7 @@
 """Grains of different sizes fall into a box; they touch where radii add up to more than the distance.
 
 python examples/gallery/grains.py [PICTURE]
+pip install -e '.[warp]' matplotlib
 """
 
 import sys

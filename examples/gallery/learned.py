@@ -1,6 +1,7 @@
 """A learned simulator: message passing over the edges of a list learns the forces of a repulsion.
 
 python examples/gallery/learned.py [PICTURE]
+pip install -e '.[warp]' matplotlib
 """
 
 import sys

@@ -1,6 +1,7 @@
 """A Lennard-Jones liquid at constant energy: a list with a skin, forces by the gradient of a sum.
 
 python examples/gallery/lennard_jones.py [PICTURE]
+pip install -e '.[warp]' matplotlib
 """
 
 import sys
