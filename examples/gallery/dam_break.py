@@ -39,10 +39,8 @@ def step(state, gravity):
     x, v, rho = state
     p = SOUND**2 * RHO / 7 * ((rho / RHO) ** 7 - 1)
     push, growth = jfrnn.pair_sum(rates, x, 2 * H, {"v": v, "p": p, "rho": rho})
-    low, high = (
-        jnp.maximum(DX / 2 - x, 0),
-        jnp.maximum(x - jnp.array([TANK, 1e3]) + DX / 2, 0),
-    )  # into the walls
+    # into the walls
+    low, high = jnp.maximum(DX / 2 - x, 0), jnp.maximum(x - jnp.array([TANK, 1e3]) + DX / 2, 0)
     v = v + DT * (push + gravity * jnp.array([0.0, -1.0]) + (SOUND / DX) ** 2 * (low - high) * 0.2)
     return x + DT * v, v, jnp.maximum(rho + DT * growth, RHO)  # a free surface does not pull
 

@@ -63,9 +63,8 @@ def main(n=800, chunks=30, faces=800):
     state = x, v, jnp.float32(0), jnp.float32(RADIUS)
     for _ in range(chunks):
         after, seen = chunk(state, tri)
-        while (
-            seen.overflow
-        ):  # more triangles near a drop than there are slots: grow, and run the chunk again
+        # more triangles near a drop than there are slots: grow, and run the chunk again
+        while seen.overflow:
             tri = seen.grow(turn(state[0], -RATE * state[2]))
             after, seen = chunk(state, tri)
         state, tri = after, seen
