@@ -18,9 +18,9 @@ def main(page: str) -> None:
     device = jax.block_until_ready(jax.numpy.zeros(1)).device
     compiled: list[float] = []
 
-    def listen(event: str, seconds: float, **_: object) -> None:
+    def listen(event: str, duration_secs: float, **_: object) -> None:
         if event.endswith("backend_compile_duration"):
-            compiled.append(seconds)
+            compiled.append(duration_secs)
 
     jax.monitoring.register_event_duration_secs_listener(listen)
     begin = perf_counter()
