@@ -17,7 +17,7 @@ project = "jfrnn"
 author = "jfrnn developers"
 release = version = jfrnn.__version__
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
-default_role = "py:obj"  # a name in single quotation marks of a docstring becomes a link where it is documented
+default_role = "py:obj"  # a name in single quotation marks becomes a link where it is documented
 autodoc_member_order = "bysource"
 autodoc_typehints_format = "short"
 autodoc_preserve_defaults = True
@@ -28,7 +28,7 @@ add_module_names = False
 python_maximum_signature_line_length = 88
 myst_enable_extensions = ["colon_fence", "deflist"]
 myst_heading_anchors = 3
-nb_execution_mode = "off"  # notebooks are kept with their outputs; tests/release/pages/test_notebooks.py runs them
+nb_execution_mode = "off"  # tests/release/pages/test_notebooks.py runs them
 nb_merge_streams = True
 smartquotes_action = "D"  # dashes alone: strings in docstrings are those of Python
 html_theme = "furo"
@@ -43,8 +43,8 @@ STUDIES = HERE.parent / "notebooks"
 
 
 def setup(app):
-    """Draw pictures, run the gallery, copy the notebooks, and keep Sphinx from reading formulas of docstrings as its own marks."""
-    print("drawing pictures, and running the programs of the gallery that changed: minutes the first time", flush=True)
+    """Draw pictures, run the gallery, copy the notebooks; keep formulas of docstrings as they are."""
+    print("drawing pictures, running programs of the gallery: minutes the first time", flush=True)
     pictures.draw(HERE / "pictures")
     gallery.run(HERE / "gallery.md", HERE / "pictures" / "gallery")
     objects.write()

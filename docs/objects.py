@@ -1,4 +1,4 @@
-"""A page for each public object, from the directives of the pages in api/, which become lists of links."""
+"""A page for each public object, from directives of the pages in api/, which become lists of links."""
 
 import importlib
 import inspect
@@ -12,7 +12,9 @@ from jfrnn._tracing import arguments
 API = Path(__file__).parent / "api"
 _BLOCK = re.compile(r"```\{eval-rst\}\n(.*?)```\n", re.DOTALL)
 _MODULE = re.compile(r"^\.\. currentmodule:: (\S+)\n", re.MULTILINE)
-_OBJECT = re.compile(r"^\.\. auto(?:function|class|exception):: ([\w.]+)(?:\(\))?\n(?:   .*\n)*", re.MULTILINE)
+_OBJECT = re.compile(
+    r"^\.\. auto(?:function|class|exception):: ([\w.]+)(?:\(\))?\n(?:   .*\n)*", re.MULTILINE
+)
 _ALIASES = (
     "AnyCutoff",
     "Points",
@@ -46,7 +48,7 @@ def write():
 
 
 def link(app, docname, source):
-    """Put links, each with the first sentence of what it leads to, where the directives of a page in api/ stand."""
+    """Put links, each with the first sentence of what it leads to, in the place of directives."""
     if docname.rpartition("/")[0] != "api":
         return
     module = ""
@@ -55,8 +57,13 @@ def link(app, docname, source):
         nonlocal module
         found = _MODULE.search(block[1])
         module = found[1] if found else module
-        items = [(_place(module, name), name) for name in (each[1] for each in _OBJECT.finditer(block[1]))]
-        lines = [f"- [`{name.rpartition('.')[2]}`](objects/{place}.md): {_first(module, name)}" for place, name in items]
+        items = [
+            (_place(module, name), name) for name in (each[1] for each in _OBJECT.finditer(block[1]))
+        ]
+        lines = [
+            f"- [`{name.rpartition('.')[2]}`](objects/{place}.md): {_first(module, name)}"
+            for place, name in items
+        ]
         tree = ["", "```{toctree}", ":hidden:", "", *(f"objects/{place}" for place, _ in items), "```"]
         return "\n".join([*lines, *tree, ""]) if items else ""
 
@@ -83,7 +90,9 @@ def _first(module, name):
 
 
 def shorten(app, what, name, obj, options, signature, returns):
-    """Write the types of arguments by the names that they have in the library: `Points` instead of all that it may be."""
+    """Write types of arguments by their names in the library: `Points`, not all that it may be."""
     for alias in _ALIASES:
-        signature = signature and signature.replace(stringify_annotation(getattr(arguments, alias), "smart"), alias)
+        signature = signature and signature.replace(
+            stringify_annotation(getattr(arguments, alias), "smart"), alias
+        )
     return signature, returns

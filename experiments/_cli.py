@@ -41,6 +41,7 @@ class Bench(_commands.Commands):
             "peers": "Ask other libraries for the hard cases.",
             "skin": "Time a list that is kept while particles move.",
             "start": "Time a fresh process up to its first result.",
+            "guides": "Time the code of each guide, and count what it compiles.",
             "structures": "Time structures of atoms, one after another.",
             "sums_report": "Measure one sum over neighbors in many ways.",
             "ties": "Time lattices full of exact ties.",

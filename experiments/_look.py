@@ -1,18 +1,21 @@
-"""How pictures look: the library in color, others in grey, a marker and a name at each line, eight methods, a headline."""
+"""How pictures look: the library in blue, each other method in a color of its own, markers, names beside marks, a headline."""
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from textwrap import fill
 
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
-from matplotlib.transforms import blended_transform_factory
+from matplotlib.transforms import Bbox, blended_transform_factory
 
 OURS, PEER, FAINT = "#0072B2", "0.4", "0.85"
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "0.6")
 """What is no method, but an angle, a layout or a stage: colors of M. Okabe and K. Ito, distinct to color-blind eyes too."""
+PEERS_COLORS = ("#C44E00", "#00805C", "#B0578D", "#8F6500", "#6A51A3", "#8C4A3C", "#4F7F1C", "0.4")
+"""Of other methods of a picture, in order: as text they can be read on white."""
 MARKERS = "osD^vPXp"
 MOST = 8  # methods in a picture
 WIDTH = 7.0  # of a picture that is to be read when it is 700 pixels wide [inches]
@@ -74,9 +77,10 @@ def choose(methods: Iterable[str]) -> list[str]:
     return [*ours, *more, *others]
 
 
-def color_of(method: str) -> str:
-    """Return the color of a method: ours, or that of all others."""
-    return OURS if is_ours(method) else PEER
+def color_of(method: str, methods: Sequence[str]) -> str:
+    """Return the color of a method among those of a picture: blue if it is ours, of two others never the same."""
+    peers = [name for name in methods if not is_ours(name)]
+    return OURS if is_ours(method) else PEERS_COLORS[peers.index(method) % len(PEERS_COLORS)]
 
 
 def marker_of(method: str, methods: Sequence[str]) -> str:
@@ -110,6 +114,7 @@ def label_logarithmic(axis: Axis, short: float = 1000) -> None:
     low, high = axis.get_view_interval()
     axis.set_major_locator(LogLocator(subs=(1, 2, 5) if high < short * low else (1,)))
     axis.set_major_formatter(PLAIN)
+    axis.set_minor_formatter(NullFormatter())
 
 
 def dress(axes: Axes, xlabel: str, ylabel: str) -> None:
@@ -117,8 +122,10 @@ def dress(axes: Axes, xlabel: str, ylabel: str) -> None:
     axes.set(xscale="log", yscale="log", xlabel=xlabel, ylabel=ylabel)
     for axis, short in ((axes.xaxis, 100), (axes.yaxis, 1000)):  # numbers side by side take more room
         label_logarithmic(axis, short)
-        axis.set_minor_formatter(NullFormatter())
     clear(axes)
+
+
+_LEADER = {"arrowstyle": "-", "color": "0.75", "lw": 0.6, "shrinkA": 1, "shrinkB": 2, "relpos": (0, 0.5)}  # to where a name begins
 
 
 def write_names(axes: Axes, ends: Sequence[tuple[str, float, float, str]]) -> None:
@@ -147,9 +154,37 @@ def write_names(axes: Axes, ends: Sequence[tuple[str, float, float, str]]) -> No
             name,
             *((x, y), (1.03, height)),
             **{"xycoords": "data", "textcoords": both, "va": "center", "ha": "left", "color": color, "fontsize": 9},
-            **{"fontweight": weight, "arrowprops": {"arrowstyle": "-", "color": "0.75", "lw": 0.6, "shrinkA": 1, "shrinkB": 4}},
+            **{"fontweight": weight, "arrowprops": _LEADER},
             annotation_clip=False,
         )
+
+
+def write_names_near(figure: Figure, axes: Axes, marks: Sequence[tuple[str, float, float, str]]) -> None:
+    """Write the name of each mark where neither a mark nor another name is: right, left, above or below, then further off.
+
+    Args:
+        figure: It, with all else that takes room, is complete.
+        axes: What the marks are drawn in; its limits are final.
+        marks: Name, x, y and color of each.
+    """
+    figure.draw_without_rendering()
+    points = [axes.transData.transform((x, y)) for _, x, y, _ in marks]
+    scale = figure.dpi / 72  # pixels per point
+    taken = [Bbox([point - 6 * scale, point + 6 * scale]) for point in points]
+    for (name, x, y, color), point in zip(marks, points, strict=True):
+        text = axes.annotate(name, (x, y), (0, 0), textcoords="offset points", color=color, fontsize=9, va="center", ha="center")
+        text.set_fontweight("bold" if color == OURS else "normal")
+        size = np.array(text.get_window_extent().size)
+        across, up = 10 * scale + size[0] / 2, 9 * scale + size[1] / 2
+        step = 1.1 * size[1]
+        places = [(side * across, k * step) for k in (0, 1, -1, 2, -2, 3, -3) for side in (1, -1)]
+        places[2:2] = [(0.0, up), (0.0, -up)]
+        boxes = [Bbox([point + place - size / 2, point + place + size / 2]) for place in places]
+        free = [k for k, box in enumerate(boxes) if axes.bbox.containsx(box.x0) and axes.bbox.containsx(box.x1)]
+        free = [k for k in free if axes.bbox.y0 <= boxes[k].y0 and boxes[k].y1 <= axes.bbox.y1] or free or [0]
+        k = next((k for k in free if not boxes[k].count_overlaps(taken)), free[0])
+        text.set_position((places[k][0] / scale, places[k][1] / scale))
+        taken.append(boxes[k])
 
 
 def headline(found: dict[str, dict[str, float]], what: str, scenes: str = "scenes", beside: bool = False) -> str:

@@ -117,17 +117,16 @@ def by_fill(rows: Sequence[SearchRow], quantity: Quantity) -> Figure:
     for name in chosen:
         line = sorted((places[asked], of[name], found[asked][name]) for asked, of in means.items() if name in of)
         x, y, values = zip(*line, strict=True)
-        axes.vlines(x, [min(of) for of in values], [max(of) for of in values], color=_look.color_of(name), linewidth=1)
+        axes.vlines(x, [min(of) for of in values], [max(of) for of in values], color=_look.color_of(name, chosen), linewidth=1)
         axes.plot(x, y, **_style(name, chosen))
-        ends.append((_look.name_of(name), x[-1], y[-1], _look.color_of(name)))
-    ticks = [number * 10.0**power for power in range(-6, 3) for number in (1, 2, 5) if number * 10**power <= 100]
+        ends.append((_look.name_of(name), x[-1], y[-1], _look.color_of(name, chosen)))
     if places:
         axes.set_xlim(min(places.values()) / 1.25, max(places.values()) * 1.25)
     _make_room(axes, [value for of in found.values() for values in of.values() for value in values])
     axes.set(xscale="log", yscale="log", xlabel="fill: points / points of the full domain [%]", ylabel=quantity.label)
-    axes.xaxis.set_major_locator(FixedLocator(ticks))
+    axes.xaxis.set_major_locator(FixedLocator(_apart(places.values(), 0.07)))
     axes.xaxis.set_minor_locator(NullLocator())
-    axes.xaxis.set_major_formatter(_look.PLAIN)
+    axes.xaxis.set_major_formatter(lambda percent, _: f"{percent:.3g}")
     _look.label_logarithmic(axes.yaxis)
     _look.write_names(axes, ends)
     return figure
@@ -137,12 +136,11 @@ def against_error(rows: Sequence[SearchRow], quantity: Quantity) -> Figure:
     """Draw a value of the scene that most methods searched over wrong pairs: what is exact in lines of its own, in order."""
     scene = _fullest_scene(row for row in rows if quantity.value(row) and row.errors is not None)
     lists = {row.method: row for row in scene if row.method not in _look.WITHOUT_LIST} or {row.method: row for row in scene}
-    exact = [row for row in lists.values() if not row.errors]
-    wrong = [row for row in lists.values() if row.errors]
-    title = f"{len(exact)} of {len(lists)} lists are exact" if len(lists) > 1 else f"{quantity.label.split(' [')[0]}".capitalize()
+    drawn = [lists[name] for name in _look.choose(row.method for row in scene) if name in lists]
+    exact, wrong = [row for row in drawn if not row.errors], [row for row in drawn if row.errors]
+    title = f"{len(exact)} of {len(drawn)} lists are exact" if len(drawn) > 1 else f"{quantity.label.split(' [')[0]}".capitalize()
     if exact and wrong and not (quantity is TIME and _beside(scene)):
-        shown = [row for row in exact if row.method in _look.choose(lists)] or exact
-        best, other = (min(of, key=lambda row: quantity.value(row) or 0) for of in (shown, wrong))
+        best, other = (min(of, key=lambda row: quantity.value(row) or 0) for of in (exact, wrong))
         ratio = _look.factor((quantity.value(other) or 0) / (quantity.value(best) or 1))
         least, times = {"fast": ("fastest", "times as long as"), "lean": ("leanest", "times the memory of")}[quantity.what]
         title += f"; the {least} of the others, {_look.spoken(other.method)}, takes {ratio} {times} {_look.spoken(best.method)}"
@@ -258,13 +256,28 @@ def _theirs(rows: Sequence[SearchRow], quantity: Quantity) -> Lines:
     return found
 
 
+def _apart(places: Iterable[float], least: float) -> list[float]:
+    """Return those of places on a logarithmic axis whose labels have room: each so much of the axis from the one before."""
+    chosen: list[float] = []
+    every = sorted(places)
+    for place in every:
+        if not chosen or math.log(place / chosen[-1]) >= least * math.log(every[-1] / every[0]):
+            chosen.append(place)
+    return chosen
+
+
 def _last(line: dict[int, float]) -> float:
     return line[max(line)] / (1 + max(line))
 
 
 def _style(method: str, chosen: Sequence[str], size: float = 6.5) -> Any:  # noqa: ANN401
     width = 2.0 if _look.is_ours(method) else 1.1
-    style = {"color": _look.color_of(method), "marker": _look.marker_of(method, chosen), "markersize": size, "linewidth": width}
+    style = {
+        "color": _look.color_of(method, chosen),
+        "marker": _look.marker_of(method, chosen),
+        "markersize": size,
+        "linewidth": width,
+    }
     return style | {"markeredgecolor": "white", "markeredgewidth": 0.6}
 
 
@@ -281,7 +294,7 @@ def _make_room(axes: Axes, drawn: Sequence[float]) -> None:
 
 
 def _name_lines(axes: Axes, lines: Lines, chosen: Sequence[str]) -> None:
-    ends = [(_look.name_of(name), max(lines[name]), lines[name][max(lines[name])], _look.color_of(name)) for name in chosen]
+    ends = [(_look.name_of(name), max(lines[name]), lines[name][max(lines[name])], _look.color_of(name, chosen)) for name in chosen]
     _look.write_names(axes, ends)
 
 
@@ -304,7 +317,7 @@ def _strip(scene: list[SearchRow], value: Value, error: Value, title: str, label
         panels[0].set(ylim=(len(exact) - 0.4, -0.6), facecolor="0.97", ylabel="exact" if len(exact) > 1 else "")
         panels[0].set_yticks(range(len(exact)), [_look.name_of(name) for name in exact])
         for text, name in zip(panels[0].get_yticklabels(), exact, strict=True):
-            text.set(color=_look.color_of(name), fontweight="bold" if _look.is_ours(name) else "normal")
+            text.set(color=_look.color_of(name, chosen), fontweight="bold" if _look.is_ours(name) else "normal")
     for name in wrong:
         panels[-1].plot(*([number] for number in marks[name]), **_style(name, chosen, 8) | {"linestyle": "none"})
     if marks:
@@ -313,9 +326,13 @@ def _strip(scene: list[SearchRow], value: Value, error: Value, title: str, label
     _look.label_logarithmic(panels[-1].xaxis, 200)
     if wrong:
         found = [marks[name][1] for name in wrong]
-        panels[-1].set(yscale="log", ylabel=errors, ylim=(max(found) * 2, min(found) / 2))
+        room = max(2.0, (max(found) / min(found)) ** 0.15)  # for names above and below
+        panels[-1].set(yscale="log", ylabel=fill(errors, 28), ylim=(max(found) * room, min(found) / room))
+        figure.align_ylabels(panels)
         if min(found) >= 1:
             _look.label_logarithmic(panels[-1].yaxis)
         panels[-1].yaxis.set_minor_formatter(NullFormatter())
-        _look.write_names(panels[-1], [(_look.name_of(name), *marks[name], _look.color_of(name)) for name in wrong])
+        _look.write_names_near(
+            figure, panels[-1], [(_look.name_of(name), *marks[name], _look.color_of(name, chosen)) for name in wrong]
+        )
     return figure

@@ -105,8 +105,8 @@ class SearchRow(TimedRow):
 
     @property
     def scene_name(self) -> str:
-        """Layout and fill in words, such as `corners 11 %`."""
-        return name_scene(self.layout, self.fill_asked)
+        """Layout and fill in words, that which was made where it is known: `corners 2.88 %` of 2 that were asked for."""
+        return name_scene(self.layout, self.fill_asked and (self.fill or self.fill_asked))
 
     @property
     def machine_kind(self) -> tuple[str, ...]:

@@ -23,13 +23,13 @@ LIGHT = ("cll", "scipy-kdtree", "scipy-kdtree-nolist", "ann-kd", "ann-kd-nolist"
 """Methods whose processes start within a second."""
 
 
-def rows(sweep: str, small: bool, results: str | None = None) -> list[SearchRow]:
+def rows(sweep: str, results: str | None = None, *, small: bool = False) -> list[SearchRow]:
     """Return the committed rows of a sweep, or, where there are none or `small` is asked for, rows of a small one made now.
 
     Args:
         sweep: Name of a config, such as sweep_orientation.
-        small: Whether to measure a coarse lattice with few methods instead, all in this process: for tests.
         results: Folder below experiments/results; without it, that of the name.
+        small: Whether to measure a coarse lattice with few methods instead, all in this process: for tests.
     """
     folder = ROOT / "results" / (results or sweep)
     if not small and (there := read_latest(folder)):

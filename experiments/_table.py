@@ -75,7 +75,8 @@ def name_scenes(rows: Sequence[SearchRow]) -> dict[tuple[Any, ...], str]:
         "motion": lambda row: f"motion {row.motion:g} dx",
     }
     shown = [text for name, text in differing.items() if len({getattr(row, name) for row in rows}) > 1]
-    return {row.scene_key: ", ".join(filter(None, [row.scene_name, *(text(row) for text in shown)])) for row in rows}
+    made = sorted(rows, key=lambda row: row.fill is not None)  # of a row that is skipped nobody knows which fill was made
+    return {row.scene_key: ", ".join(filter(None, [row.scene_name, *(text(row) for text in shown)])) for row in made}
 
 
 def megabytes(count: int | None) -> float | None:

@@ -1,6 +1,7 @@
-"""A dam break by smoothed particle hydrodynamics in 2D, and how its front depends on gravity: a gradient through the run.
+"""A dam break in 2D by smoothed particles, and a gradient through the run: the front over gravity.
 
 python examples/gallery/dam_break.py [PICTURE]
+pip install -e '.[warp]' matplotlib
 """
 
 import functools
@@ -25,7 +26,7 @@ def slope(r):
 
 
 def rates(r, i, j):
-    """Acceleration and rate of the density that j causes at i, from pressures and an artificial viscosity."""
+    """Acceleration and rate of the density that j causes at i: pressures, an artificial viscosity."""
     m, v = RHO * DX**2, i["v"] - j["v"]
     approach = jnp.minimum(-(v @ r), 0.0) * H / (r @ r + 0.01 * H**2)
     viscous = -0.1 * SOUND * approach / RHO
@@ -38,7 +39,8 @@ def step(state, gravity):
     x, v, rho = state
     p = SOUND**2 * RHO / 7 * ((rho / RHO) ** 7 - 1)
     push, growth = jfrnn.pair_sum(rates, x, 2 * H, {"v": v, "p": p, "rho": rho})
-    low, high = jnp.maximum(DX / 2 - x, 0), jnp.maximum(x - jnp.array([TANK, 1e3]) + DX / 2, 0)  # into the walls
+    # into the walls
+    low, high = jnp.maximum(DX / 2 - x, 0), jnp.maximum(x - jnp.array([TANK, 1e3]) + DX / 2, 0)
     v = v + DT * (push + gravity * jnp.array([0.0, -1.0]) + (SOUND / DX) ** 2 * (low - high) * 0.2)
     return x + DT * v, v, jnp.maximum(rho + DT * growth, RHO)  # a free surface does not pull
 
@@ -51,18 +53,23 @@ def run(gravity, steps, state):
 
 @functools.partial(jax.jit, static_argnums=1)
 def front(gravity, steps, state):
-    """Where the water's front is: a soft maximum of x. A scan, which can be differentiated in reverse."""
+    """Where the front is: a soft maximum of x. A scan can be differentiated in reverse."""
     x = jax.lax.scan(jax.checkpoint(lambda s, _: (step(s, gravity), None)), state, None, steps)[0][0]
     return DX * jax.nn.logsumexp(x[:, 0] / DX)
 
 
 def main(nx=16, steps=1600, differentiated=100):
-    """Print how far the front is and how that changes with gravity; return the state at the end, and its time [s]."""
-    sites = np.stack(np.meshgrid(np.arange(nx), np.arange(2 * nx), indexing="ij"), axis=-1).reshape(-1, 2)
+    """Print where the front is, and its slope over gravity; return the last state and its time [s]."""
+    sites = np.stack(np.meshgrid(np.arange(nx), np.arange(2 * nx), indexing="ij"), axis=-1).reshape(
+        -1, 2
+    )
     x = jnp.asarray((sites + 0.5) * DX, jnp.float32)
     start = x, jnp.zeros_like(x), jnp.full(len(x), RHO, x.dtype)
     reached, change = jax.value_and_grad(front)(jnp.float32(GRAVITY), differentiated, start)
-    print(f"{len(x)} particles; front after {differentiated} steps: {reached:.3f} m, its slope over gravity {change:.1e} s²")
+    print(
+        f"{len(x)} particles; front after {differentiated} steps: {reached:.3f} m, its slope over "
+        f"gravity {change:.1e} s²"
+    )
     assert change > 0, "more gravity drives the front forward"
     return run(jnp.float32(GRAVITY), steps, start), steps * DT
 

@@ -1,6 +1,7 @@
-"""Particles on four devices, here virtual ones of a CPU: a time loop in which they move from device to device.
+"""Particles on four devices, here virtual ones of a CPU, move from device to device in a time loop.
 
 XLA_FLAGS=--xla_force_host_platform_device_count=4 python examples/gallery/devices.py [PICTURE]
+pip install -e '.[warp]' matplotlib
 """
 
 import sys
@@ -22,7 +23,7 @@ def push(r, i, j):
 
 @jax.jit
 def chunk(particles, nbrs):
-    """Twenty steps: neighbors push, and all turn about the middle; `update` moves particles between devices when it rebuilds."""
+    """Twenty steps: neighbors push, all turn; where `update` rebuilds, particles change devices."""
 
     def step(_, carry):
         particles, nbrs = carry
@@ -52,7 +53,10 @@ def main(n=1000, chunks=2):
     device = np.empty(n, int)
     for k, row in enumerate(ids):
         device[row[row >= 0]] = k
-    print(f"{n} particles on {jax.device_count()} devices: {np.bincount(device).tolist()}, {len(nbrs.pairs()[0])} pairs")
+    print(
+        f"{n} particles on {jax.device_count()} devices: {np.bincount(device).tolist()}, "
+        f"{len(nbrs.pairs()[0])} pairs"
+    )
     particles.check()
     nbrs.check()
     return distributed.collect(particles)[0], device
@@ -62,5 +66,10 @@ if __name__ == "__main__":
     x, device = main()
     figure, axes = plt.subplots(figsize=(5, 5), layout="constrained")
     axes.scatter(*x.T, c=device, cmap="viridis", s=6)
-    axes.set(aspect="equal", title=f"{len(x)} particles, each in the color of its device", xticks=[], yticks=[])
+    axes.set(
+        aspect="equal",
+        title=f"{len(x)} particles, each in the color of its device",
+        xticks=[],
+        yticks=[],
+    )
     figure.savefig(sys.argv[1] if len(sys.argv) > 1 else "devices.png", dpi=100)

@@ -1,6 +1,7 @@
 """A jet of drops onto a turning gear: distances to a wall of triangles, in the frame of the gear.
 
 python examples/gallery/gear.py [PICTURE]
+pip install -e '.[warp]' matplotlib
 """
 
 import sys
@@ -24,7 +25,7 @@ def turn(x, angle):
 
 @jax.jit
 def chunk(state, tri):
-    """Fifty steps of drops that the wall pushes out along its normal; the list keeps the gear's tree, only drops move."""
+    """Fifty steps of drops that the wall pushes out by its normal; the list keeps the gear's tree."""
 
     def step(_, carry):
         (x, v, time, deepest), tri = carry
@@ -49,19 +50,29 @@ def main(n=800, chunks=30, faces=800):
     vertices = jnp.asarray(vertices, jnp.float32)
     top = float(jnp.abs(vertices[:, 1]).max())
     random = np.random.default_rng(0)
-    x = np.column_stack([random.normal(1.0, 0.3, n), top + 1 + random.uniform(0, SPEED * LAST * 0.8, n), random.normal(0, 0.4, n)])
+    x = np.column_stack(
+        [
+            random.normal(1.0, 0.3, n),
+            top + 1 + random.uniform(0, SPEED * LAST * 0.8, n),
+            random.normal(0, 0.4, n),
+        ]
+    )
     x = jnp.asarray(x, jnp.float32)
     v = jnp.zeros_like(x).at[:, 1].set(-SPEED)
     tri = jfrnn.search_triangles(x, vertices, named, 4 * RADIUS, capacity=64)
     state = x, v, jnp.float32(0), jnp.float32(RADIUS)
     for _ in range(chunks):
         after, seen = chunk(state, tri)
-        while seen.overflow:  # more triangles near a drop than there are slots: grow, and run the chunk again
+        # more triangles near a drop than there are slots: grow, and run the chunk again
+        while seen.overflow:
             tri = seen.grow(turn(state[0], -RATE * state[2]))
             after, seen = chunk(state, tri)
         state, tri = after, seen
     tri.check()
-    print(f"{n} drops, {len(named)} triangles; the least distance of a center from the wall was {float(state[3]):.3f}")
+    print(
+        f"{n} drops, {len(named)} triangles; the least distance of a center from the wall was "
+        f"{float(state[3]):.3f}"
+    )
     assert state[3] > -RADIUS, "a drop has passed the wall: take a smaller DT"
     return np.asarray(state[0]), np.asarray(turn(vertices, RATE * state[2])), np.asarray(named)
 
@@ -72,6 +83,11 @@ if __name__ == "__main__":
     axes.tripcolor(*vertices[:, :2].T, named, vertices[:, 2], cmap="Greys", vmin=-6, vmax=8)
     axes.plot(*x[:, :2].T, ".", ms=3, color="tab:orange")
     axes.set(
-        aspect="equal", xlim=(-9, 9), ylim=(-8, 11), xticks=[], yticks=[], title="Drops of a jet are thrown off by a turning gear"
+        aspect="equal",
+        xlim=(-9, 9),
+        ylim=(-8, 11),
+        xticks=[],
+        yticks=[],
+        title="Drops of a jet are thrown off by a turning gear",
     )
     figure.savefig(sys.argv[1] if len(sys.argv) > 1 else "gear.png", dpi=100)

@@ -1,6 +1,7 @@
-"""Grains of different sizes fall into a box: they touch where centers are closer than the sum of their radii.
+"""Grains of different sizes fall into a box; they touch where radii add up to more than the distance.
 
 python examples/gallery/grains.py [PICTURE]
+pip install -e '.[warp]' matplotlib
 """
 
 import sys
@@ -18,7 +19,7 @@ STIFF, DAMPED, DT, WIDE = 2e4, 20.0, 5e-4, 1.0
 
 
 def contact(r, i, j):
-    """Acceleration of i by a grain that touches it, a damped spring along the line of centers; and 1, which counts contacts."""
+    """Acceleration of i by a grain that touches it, a damped spring; and 1, which counts contacts."""
     distance = jnp.sqrt(r @ r + 1e-12)
     away = -r / distance
     overlap = i["radius"] + j["radius"] - distance
@@ -29,13 +30,18 @@ def contact(r, i, j):
 
 @jax.jit
 def frame(x, v, radius):
-    """Forty steps; by the rule "sum", two grains are neighbors if their centers are closer than the sum of their radii."""
+    """Forty steps; by the rule "sum", grains closer than the sum of their radii are neighbors."""
     m = radius**2
 
     def step(_, state):
         x, v, _ = state
-        a, touching = jfrnn.pair_sum(contact, x, radius, {"v": v, "radius": radius, "m": m}, radius_rule="sum")
-        low, high = jnp.maximum(radius[:, None] - x, 0), jnp.maximum(x + radius[:, None] - jnp.array([WIDE, 1e3]), 0)
+        a, touching = jfrnn.pair_sum(
+            contact, x, radius, {"v": v, "radius": radius, "m": m}, radius_rule="sum"
+        )
+        low, high = (
+            jnp.maximum(radius[:, None] - x, 0),
+            jnp.maximum(x + radius[:, None] - jnp.array([WIDE, 1e3]), 0),
+        )
         a = a + STIFF * (low - high) - DAMPED * v * ((low > 0) | (high > 0)) + jnp.array([0.0, -9.81])
         v = v + DT * a
         return x + DT * v, v, touching
@@ -63,14 +69,25 @@ def main(across=12, up=12, frames=60):
 if __name__ == "__main__":
     radius, seen = main()
     figure, axes = plt.subplots(figsize=(4, 4.4))
-    axes.set(aspect="equal", xlim=(0, WIDE), ylim=(0, 1.0), xticks=[], yticks=[], title=f"{len(radius)} grains of three sizes")
+    axes.set(
+        aspect="equal",
+        xlim=(0, WIDE),
+        ylim=(0, 1.0),
+        xticks=[],
+        yticks=[],
+        title=f"{len(radius)} grains of three sizes",
+    )
     shape = 2 * radius, 2 * radius, 0 * radius
-    grains = EllipseCollection(*shape, units="xy", offsets=seen[0], offset_transform=axes.transData, array=radius)
+    grains = EllipseCollection(
+        *shape, units="xy", offsets=seen[0], offset_transform=axes.transData, array=radius
+    )
     axes.add_collection(grains)
     pictures = []
     for x in seen[::4]:
         grains.set_offsets(x)
         figure.canvas.draw()
-        pictures.append(Image.fromarray(np.asarray(figure.canvas.buffer_rgba())).convert("RGB").quantize(32))
+        pictures.append(
+            Image.fromarray(np.asarray(figure.canvas.buffer_rgba())).convert("RGB").quantize(32)
+        )
     name = sys.argv[1] if len(sys.argv) > 1 else "grains.gif"
     pictures[0].save(name, save_all=True, append_images=pictures[1:], duration=100, loop=0)

@@ -1,6 +1,7 @@
-"""A learned simulator: message passing over the edges of a list, trained to know the forces of a soft repulsion.
+"""A learned simulator: message passing over the edges of a list learns the forces of a repulsion.
 
 python examples/gallery/learned.py [PICTURE]
+pip install -e '.[warp]' matplotlib
 """
 
 import sys
@@ -60,7 +61,10 @@ def main(steps=200):
         if status != 0:
             raise RuntimeError(f"{jfrnn.Status(int(status))}: more edges are needed")
         losses.append(float(loss))
-    print(f"squared error of the forces, over their square: {losses[0]:.2f} at first, {losses[-1]:.1e} after {steps} steps")
+    print(
+        f"squared error of the forces, over their square: {losses[0]:.2f} at first, "
+        f"{losses[-1]:.1e} after {steps} steps"
+    )
     assert losses[-1] < 0.2 * losses[0], "it has not learned: take more steps"
     return losses
 

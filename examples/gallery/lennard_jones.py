@@ -1,6 +1,7 @@
-"""A Lennard-Jones liquid at constant energy: a list with a skin, forces by the gradient of a sum over its pairs.
+"""A Lennard-Jones liquid at constant energy: a list with a skin, forces by the gradient of a sum.
 
 python examples/gallery/lennard_jones.py [PICTURE]
+pip install -e '.[warp]' matplotlib
 """
 
 import sys
@@ -28,7 +29,7 @@ def potential(x, nbrs):
 
 @jax.jit
 def chunk(state, nbrs):
-    """Fifty steps of velocity Verlet; `update` rebuilds the list when something has moved half the skin."""
+    """Fifty steps of velocity Verlet; `update` rebuilds when something has moved half the skin."""
 
     def step(_, carry):
         (x, v, f), nbrs = carry
@@ -55,7 +56,10 @@ def main(side=8, chunks=20):
         energies.append((float(potential(state[0], nbrs)) / n, float(0.5 * (state[1] ** 2).sum()) / n))
     energies = np.array(energies)
     drift = float(np.ptp(energies.sum(axis=1)))
-    print(f"{n} particles, {50 * chunks} steps, {int(nbrs.rebuild_count)} rebuilds; the total energy stays within {drift:.4f}")
+    print(
+        f"{n} particles, {50 * chunks} steps, {int(nbrs.rebuild_count)} rebuilds; the total energy "
+        f"stays within {drift:.4f}"
+    )
     assert drift < 0.01, "energy is not conserved: take a smaller DT"
     return energies
 
@@ -65,10 +69,17 @@ if __name__ == "__main__":
     figure, axes = plt.subplots(figsize=(7, 4), layout="constrained")
     time = 50 * DT * np.arange(1, len(energies) + 1)
     for values, name, style in zip(
-        (*energies.T, energies.sum(axis=1)), ("potential", "kinetic", "total"), ("--", ":", "-"), strict=True
+        (*energies.T, energies.sum(axis=1)),
+        ("potential", "kinetic", "total"),
+        ("--", ":", "-"),
+        strict=True,
     ):
         axes.plot(time, values, style, color="k" if name == "total" else "tab:blue", linewidth=2)
         axes.annotate(f" {name}", (time[-1], values[-1]), va="center")
-    axes.set(xlabel="time", ylabel="energy per particle", title="Potential and kinetic energy fluctuate, their sum does not")
+    axes.set(
+        xlabel="time",
+        ylabel="energy per particle",
+        title="Potential and kinetic energy fluctuate, their sum does not",
+    )
     axes.spines[["top", "right"]].set_visible(False)
     figure.savefig(sys.argv[1] if len(sys.argv) > 1 else "lennard_jones.png", dpi=100)

@@ -61,13 +61,13 @@ def _rows(what: str, who: str, checkout: Path, repeat: int) -> Iterator[table.Li
     with tempfile.TemporaryDirectory() as name:
         packages, kernels = Path(name) / "packages", Path(name) / "kernels"
         kernels.mkdir()
-        _link(checkout, packages)
+        link(checkout, packages)
         for cache in ("cold", "warm"):
             row = {"who": who, "what": what, "cache": cache, "repeat": repeat, **_machine.commit(checkout)}
             yield row | measure_process(what, packages, kernels)
 
 
-def _link(checkout: Path, packages: Path) -> None:
+def link(checkout: Path, packages: Path) -> None:
     """Make a folder that holds the library of a checkout as an installation does: kernels and cases are packages of it."""
     (packages / "jfrnn").mkdir(parents=True)
     parts = {part.name: part for part in (checkout / "jfrnn").iterdir()}
@@ -78,14 +78,28 @@ def _link(checkout: Path, packages: Path) -> None:
 
 
 def measure_process(what: str, packages: Path, kernels: Path) -> table.Line:
-    """Return the columns of a process that takes the library from one folder and keeps kernels in another.
+    """Return the columns of a process up to its first results, `search` or `gradient`."""
+    row = run(first_result.__file__, what, packages, kernels)
+    return row | {"wait_s": row["import_jfrnn_s"] + row["first_s"]} if row["status"] == "ok" else row
+
+
+def run(program: str, asked: str, packages: Path, kernels: Path, more: dict[str, str] | None = None) -> table.Line:
+    """Run a program in a process that takes the library from one folder and keeps kernels in another, and return what it says.
 
     Where the library takes a slower engine than it would choose, it warns, and the process fails.
+
+    Args:
+        program: A file; its last line on standard output is a row as JSON.
+        asked: Its argument.
+        packages: A folder that `link` made.
+        kernels: Where Warp keeps what it compiles.
+        more: Variables of the environment.
     """
     not_given = ("XLA_PYTHON_CLIENT_PREALLOCATE", "JAX_COMPILATION_CACHE_DIR")
     environment = {name: value for name, value in os.environ.items() if name not in not_given}
     environment |= {"PYTHONPATH": str(packages), "WARP_CACHE_PATH": str(kernels), "CUDA_CACHE_PATH": str(kernels / "cuda")}
-    words = [sys.executable, "-P", "-W", "error::RuntimeWarning", first_result.__file__, what]
+    environment |= more or {}
+    words = [sys.executable, "-P", "-W", "error::RuntimeWarning", program, asked]
     begin, bystanders = perf_counter(), _measure.Bystanders()
     try:
         done = subprocess.run(words, capture_output=True, text=True, check=False, env=environment, cwd=kernels, timeout=_MOST_S)
@@ -95,7 +109,7 @@ def measure_process(what: str, packages: Path, kernels: Path) -> table.Line:
     if done.returncode != 0:
         return {"status": "failed", "reason": " ".join(done.stderr.split())[-300:]}
     row: dict[str, Any] = json.loads(lines[-1])
-    row |= {"wait_s": row["import_jfrnn_s"] + row["first_s"], "process_s": seconds, "said_lines": len(lines) - 1}
+    row |= {"process_s": seconds, "said_lines": len(lines) - 1}
     return row | {"others_cores": None if others is None else round(others, 2), "status": "ok"}
 
 

@@ -68,7 +68,7 @@ class Way(NamedTuple):
 
 
 def poly6(cutoff: float) -> Callable[[Any, Any, Any], Any]:
-    """Return the kernel of a density (Müller et al. 2003, doi:10.2312/SCA03/154-159), as `jfrnn.pair_sum` takes it."""
+    """Return a density's kernel (Müller et al. 2003, doi:10.2312/SCA03/154-159) for `jfrnn.pair_sum`."""
     import jax.numpy as jnp
 
     scale = 315 / (64 * math.pi * cutoff**3)

@@ -49,7 +49,9 @@ def search_known() -> str:
 def search_scenes() -> str:
     """Return seconds of all methods by scene."""
     rows = read("thesis_cpu/table.csv")
-    scenes = {"corners 2 %": "corners", "clusters4 11 %": "4 clusters", "clusters20 51 %": "20 clusters", "full 100 %": "full"}
+    layouts = (("corners", "0.02"), ("clusters4", "0.11"), ("clusters20", "0.51"), ("full", "1.0"))
+    titles = ("corners", "4 clusters", "20 clusters", "full")
+    scenes = {row["scene"]: titles[layouts.index(key)] for row in rows if (key := (row["layout"], row["fill_asked"])) in layouts}
     full = {row["method"]: float(row["median_s"] or "inf") for row in rows if row["scene"] == "full 100 %"}
     methods = sorted(dict.fromkeys(row["method"] for row in rows), key=lambda method: full.get(method, float("inf")))
     points = {scene: whole(next(row["points"] for row in rows if row["scene"] == scene)) for scene in scenes}

@@ -22,10 +22,13 @@ def _beside_answers(rows: list[dict[str, str]]) -> str:
 def inverse() -> str:
     """Return what problems solved by gradients found."""
     lines = []
-    for problem in ("viscosity", "jet", "droplet"):
-        for row in read(f"sph_gradients/{problem}.csv"):
+    for problem, part in (("viscosity", ""), ("jet", ", along {axis}"), ("droplet", ", interval {k} of {count}")):
+        rows = read(f"sph_gradients/{problem}.csv")
+        for k, row in enumerate(rows, start=1):
+            name, *unit = row["unknown"].partition(" [")
+            sought = "".join((name, part.format(axis="xyz"[(k - 1) % 3], k=k, count=len(rows)), *unit))
             values = [number(row[name]) for name in ("guess", "found", "known", "first loss", "loss")]
-            lines.append([problem, row["unknown"], *values, row["runs"], whole(row["steps"]), row["particles"]])
+            lines.append([problem, sought, *values, row["runs"], whole(row["steps"]), row["particles"]])
     heads = ("problem", "sought", ">first guess", ">found", ">known", ">loss, first", ">best", ">runs", ">steps", ">particles")
     return markdown(heads, lines)
 

@@ -21,6 +21,7 @@ import contextlib, pathlib, runpy, sys
 given = sys.argv[1:]
 for program, picture in zip(given[::2], given[1::2], strict=True):
     sys.argv = [program, picture]
+    print(f"gallery: {pathlib.Path(program).stem}, {given.index(program) // 2 + 1} of {len(given) // 2}", flush=True)
     with pathlib.Path(picture).with_suffix(".txt").open("w", encoding="utf-8") as said, contextlib.redirect_stdout(said):
         runpy.run_path(program, run_name="__main__")
     if "matplotlib.pyplot" in sys.modules:
@@ -51,9 +52,9 @@ def run(page: Path, folder: Path) -> list[str]:
     told = os.environ | {"PYTHONPATH": str(ROOT), "XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu", "MPLBACKEND": "agg"}
     asked = [str(path) for name in names for path in (PROGRAMS / f"{name}.py", pictures[name])]
     command = [sys.executable, "-W", "error::RuntimeWarning", "-c", _RUN, *asked]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, env=told)
+    done = subprocess.run(command, stderr=subprocess.PIPE, text=True, check=False, env=told)  # what it says is seen meanwhile
     if done.returncode:
-        raise RuntimeError(f"a program of the gallery failed:\n{done.stdout}{done.stderr}")
+        raise RuntimeError(f"a program of the gallery failed:\n{done.stderr}")
     note.write_text(json.dumps(wanted, indent=1), encoding="utf-8")
     return names
 

@@ -105,6 +105,21 @@ def _tree_disagrees() -> str:
     return ", ".join(said)
 
 
+def _first(guide: str) -> Callable[[], str]:
+    """Return what the code of a guide compiles, and how long it takes in a fresh process, the first time and later."""
+
+    def value() -> str:
+        rows = read("latency/guides_cpu.csv")
+        cold, warm = (one(rows, guide=guide, cache=cache, status="ok") for cache in ("cold", "warm"))
+        assert cold is not None and warm is not None, guide
+        programs, kernels = (f"{cold[what]} {what if cold[what] != '1' else what[:-1]}" for what in ("programs", "kernels"))
+        made = f"{programs} of XLA and {kernels}" if cold["kernels"] != "0" else f"{programs} of XLA"
+        seconds = [number(row["page_s"], digits=2) for row in (cold, warm)]
+        return f"{made}, and takes {seconds[0]} s in a fresh process the first time on a machine, {seconds[1]} s in later ones"
+
+    return value
+
+
 VALUES: dict[str, Callable[[], str]] = {
     "gpu-bytes-counts": _bytes_per_particle("warp-counts"),
     "gpu-bytes-density": _bytes_per_particle("pair-sum"),
@@ -119,4 +134,6 @@ VALUES: dict[str, Callable[[], str]] = {
     "density-64m-ms": _density("ms"),
     "density-64m-ns": _density("ns"),
     "tree-disagrees": _tree_disagrees,
-} | {f"cases-{kind}": (lambda cases=cases: str(len(cases))) for kind, cases in _CASES.items()}
+}
+VALUES |= {f"first-{row['guide']}": _first(row["guide"]) for row in read("latency/guides_cpu.csv") if row["cache"] == "cold"}
+VALUES |= {f"cases-{kind}": (lambda cases=cases: str(len(cases))) for kind, cases in _CASES.items()}

@@ -12,7 +12,7 @@ from jax.core import Tracer
 
 from jfrnn._geometry.reach import count_cells
 from jfrnn._geometry.reduced import short_vectors
-from jfrnn._tracing import Given, make_on_host, on_device, own_transfers
+from jfrnn._tracing import Given, as_array, make_on_host, on_device, own_transfers
 
 _SINGULAR = 1e-9  # determinants below may be those of dependent rows
 Numbers = Any  # an array of NumPy or JAX, concrete or traced
@@ -271,7 +271,7 @@ def _real(name: str, value: Given) -> Numbers:
         if not jnp.issubdtype(value.dtype, jnp.floating):
             raise TypeError(f"{name} must be real numbers, got a traced {value.dtype}.")
         return value
-    array = np.asarray(value)
+    array = np.asarray(value if isinstance(value, list | tuple) else as_array(name, value))
     if array.dtype.kind not in "fiu":
         raise TypeError(f"{name} must be real numbers, got {type(value).__name__} {value!r}.")
     return array.astype(array.dtype if array.dtype in (np.float32, np.float64) else np.float64)  # a copy of the user's array

@@ -122,6 +122,7 @@ def check_radii(cutoff: Given, rule: object, sources: Array, queries: Array | No
     if rule not in (*RULES, SUM):
         raise ValueError(f"radius_rule must be one of {', '.join(map(repr, (*RULES, SUM)))}, got {rule!r}.")
     summed, rule = rule == SUM, "mean" if rule == SUM else str(rule)
+    cutoff = cutoff if isinstance(cutoff, tuple | list) else as_array("cutoff", cutoff)
     if not isinstance(cutoff, tuple | list) and np.ndim(cutoff) == 2:
         raise ValueError(
             f"cutoff has shape {list(np.shape(cutoff))}, that of a table of cutoffs of pairs of species: pass species=, that of "

@@ -51,13 +51,18 @@ def test_exclusions_that_name_nobody_are_named():
         jfrnn.count(POINTS, 1.0, exclude=[[0, 99]])
 
 
-@pytest.mark.parametrize("name", ["positions", "queries", "active", "batch", "species", "exclude"])
+@pytest.mark.parametrize("name", ["positions", "cutoff", "queries", "active", "batch", "species", "exclude"])
 def test_arrays_of_others_come_by_dlpack(name):
-    given = {"positions": POINTS, "cutoff": [[1.0]] if name == "species" else 1.0, name: Foreign()}
+    given = {"positions": POINTS, "cutoff": [[1.0]] if name == "species" else 1.0} | {name: Foreign()}
     with pytest.raises(
         TypeError, match=rf"{name} must be an array of JAX or NumPy, got test_arguments.Foreign: pass jnp.from_dlpack\({name}\)"
     ):
         jfrnn.count(given.pop("positions"), given.pop("cutoff"), **given)
+
+
+def test_boxes_of_others_are_named():
+    with pytest.raises(TypeError, match=r"pass jnp.from_dlpack\(lengths_or_matrix\)"):
+        jfrnn.Box(Foreign())
 
 
 def test_values_of_others_are_named():

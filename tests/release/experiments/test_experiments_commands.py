@@ -18,7 +18,7 @@ ROOT = Path(_commands.__file__).resolve().parent.parent
 CONFIGS = ROOT / "experiments" / "configs"
 TOP = ("run", "init", "report", "tables", "merge", "list", "show", "export", "gpu", "bench", "sph")
 BENCH = (
-    *("crossover", "crystals", "distributed", "arrays", "latency", "lj", "options", "peers", "skin", "start"),
+    *("crossover", "crystals", "distributed", "arrays", "latency", "lj", "options", "peers", "skin", "start", "guides"),
     *("structures", "sums", "ties", "triangles"),
 )
 SPH = ("validate", "speed", "gradients")

@@ -5,7 +5,7 @@ import pytest
 from typer.testing import CliRunner
 
 from experiments._cli import app
-from experiments.bench import start
+from experiments.bench import guides, start
 
 
 @pytest.mark.parametrize("what", [("search",), pytest.param(start.WHAT, marks=pytest.mark.slow)], ids="+".join)
@@ -25,7 +25,7 @@ def test_rows_of_fresh_processes(monkeypatch, tmp_path, what):
 
 
 def test_a_process_that_fails_says_why(tmp_path):
-    start._link(start.ROOT, tmp_path / "packages")
+    start.link(start.ROOT, tmp_path / "packages")
     row = start.measure_process("nothing", tmp_path / "packages", tmp_path)
     assert row["status"] == "failed"
     assert row["reason"].endswith("KeyError: 'nothing'")
@@ -43,3 +43,17 @@ def test_two_checkouts_are_named_and_compared(tmp_path):
     assert list(table["wait_s"][:2]) == [4.0, 1.5]
     assert list(table["ratio"][:2]) == [1.0, 1.5 / 4]
     assert table["what"].iloc[-1] == "failed: a stone"
+
+
+@pytest.mark.slow
+def test_guides_are_run_and_what_they_compile_is_counted(monkeypatch, tmp_path):
+    (tmp_path / "one.md").write_text(
+        "```python\nimport jfrnn\n\nn = jfrnn.count([[0.0, 0.0]], 1.0)\n```\n\n```python\nassert n[0] == 0\n```\n"
+    )
+    monkeypatch.setattr(guides, "GUIDES", tmp_path)
+    result = CliRunner().invoke(app, ["bench", "guides", "--out", str(tmp_path)])
+    assert result.exit_code == 0, result.output
+    table = pd.read_csv(tmp_path / "guides_cpu.csv")
+    assert list(zip(table["guide"], table["cache"], table["status"])) == [("one", "cold", "ok"), ("one", "warm", "ok")]
+    assert table["programs"].nunique() == 1 and (table["programs"] > 0).all() and (table["kernels"] > 0).all()
+    assert (table["compile_s"] < table["page_s"]).all() and (table["page_s"] < table["process_s"]).all()

@@ -41,7 +41,7 @@ def test_processes_become_one_row():
     failed = replace(rows[0], key="f", process=9, status="failed", reason="no", median_s=None)
     partial = _statistics.summarize([*rows, failed])[0]
     assert (partial.status, partial.processes, partial.reason) == ("ok", 5, "1 of 6 processes, the first of them failed: no")
-    assert "- corners 11 %, jax: 1 of 6 processes, the first of them failed: no" in _report.markdown(
+    assert "- corners 11.26 %, jax: 1 of 6 processes, the first of them failed: no" in _report.markdown(
         [*rows, failed], _table.lines([*rows, failed]), []
     )
     assert _statistics.summarize([failed])[0].reason == "no"

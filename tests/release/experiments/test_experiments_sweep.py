@@ -75,7 +75,7 @@ def test_each_method_gives_a_whole_row(swept):
         assert {name for name, value in row.items() if value in (None, [], {})} <= optional, row["method"]
         assert (row["layout"], row["fill_asked"], row["points"], row["fill"]) == ("corners", 0.11, 256, 0.128)
         assert (row["spacing"], row["cutoff"], row["dtype"]) == (5e-4, float(np.float32(1.5e-3)), "float32")
-        assert f"corners 11 %      {row['method']}" in swept.done.stderr
+        assert f"corners 12.8 %    {row['method']}" in swept.done.stderr, "the fill that was made"
 
 
 def test_times_and_memory_of_a_row_fit_together(swept):

@@ -148,3 +148,9 @@ def test_a_figure_that_is_none_of_the_rows_is_found():
     assert pages.fill_in(text) == text.replace("1 000", pages.VALUES["jet-steps"]()) != text
     with pytest.raises(UsageError, match="there is no such value"):
         pages.fill_in(text.replace("jet", "oil"))
+
+
+def test_no_head_of_a_table_breaks_inside_a_number():
+    """Numbers of heads are written with spaces that do not break."""
+    broken = re.compile(r"^\|.*\d \d{3}.*\|\n\|[ :|-]+\|$", re.MULTILINE)
+    assert [page.name for page in pages.pages() if broken.search(page.read_text(encoding="utf-8"))] == []

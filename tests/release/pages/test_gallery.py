@@ -13,7 +13,7 @@ PAGE = ROOT / "docs" / "gallery.md"
 def test_every_program_is_shown():
     programs = {path.stem: path.read_text(encoding="utf-8") for path in gallery.PROGRAMS.glob("*.py")}
     assert len(programs) == 7
-    assert max(text.count("\n") for text in programs.values()) <= 80
+    assert max(text.count("\n") for text in programs.values()) <= 95
     page = PAGE.read_text(encoding="utf-8")
     for shown in (
         r"literalinclude} \.\./examples/gallery/(\w+)\.py",
