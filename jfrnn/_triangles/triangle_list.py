@@ -382,8 +382,8 @@ def _contacts_in_rows(
 @compile_program
 def _are_parted(tri: TriangleList, points: Array, vertices: Array, pairs: Array) -> Array:
     corners, finite, there = gather_corners(vertices, tri.faces)
-    n = jnp.iinfo(pairs.dtype).max if tri.idx.shape[0] > jnp.iinfo(pairs.dtype).max else tri.idx.shape[0]
-    known = jnp.where((pairs >= 0) & (pairs < n), pairs, -1).astype(jnp.int32)
+    wide = pairs if pairs.dtype.itemsize > 2 else pairs.astype(jnp.int32)  # which holds how many particles there are
+    known = jnp.where((wide >= 0) & (wide < tri.idx.shape[0]), wide, -1).astype(jnp.int32)
     used = jnp.minimum(tri.count, tri.capacity)
     return call_apart(are_crossed, *lax.stop_gradient((points, corners)), finite & there, tri.idx, used, known)
 
