@@ -64,7 +64,8 @@ def _evaluate(found: list[_Best], operands: Groups, term: Term, n: int) -> list[
     for k, (like, (_, source, shift)) in enumerate(zip(term.summands, found, strict=True)):
         has, (m, elements) = source < n, source.shape
         shifts = None if shift is None else shift.reshape(-1, 1, shift.shape[-1])
-        one_each = Listed(jnp.where(has, source, 0).reshape(-1, 1), has.reshape(-1, 1), shifts, n, symmetric=False)
+        idx, mask = jnp.where(has, source, 0).reshape(-1, 1), has.reshape(-1, 1)
+        one_each = Listed(idx=idx, mask=mask, shifts=shifts, source_count=n, symmetric=False)
         element, needed = _element(term, k)
         own = tuple(jnp.repeat(x, elements, axis=0) for x in operands.own)
         number = (jnp.tile(lax.iota(jnp.int32, elements), m),)

@@ -128,11 +128,12 @@ def _relation_of_list(
     """Return the pairs of a list: of padded ones Warp's kernels decide while they sum; else all is decided at once."""
     if isinstance(nbrs, EdgeList):
         mask, shifts = nbrs._close_edges(sources, rows, box)
-        return Flat(nbrs.senders, nbrs.receivers, nbrs.offsets, mask, shifts, nbrs.source_count, symmetric)
+        kind = {"source_count": nbrs.source_count, "symmetric": symmetric}
+        return Flat(senders=nbrs.senders, receivers=nbrs.receivers, offsets=nbrs.offsets, mask=mask, shifts=shifts, **kind)
     topology, nobody = nbrs._topology(), 0 in (*nbrs.idx.shape, nbrs.source_count)
     if nobody or not is_native(topology, nbrs.box_kind, nbrs.half) or nbrs.idx.size > MOST_SLOTS:
         _, mask, shifts = nbrs._geometry_of(sources, rows, box)
-        return Listed(nbrs.idx, mask, shifts, nbrs.source_count, symmetric)
+        return Listed(idx=nbrs.idx, mask=mask, shifts=shifts, source_count=nbrs.source_count, symmetric=symmetric)
     nbrs._check_known(spared=ROWS_ARE_WHOLE)
     cutoff = nbrs.radii if nbrs.cutoff is None else make_cutoff(nbrs.cutoff, nbrs.dtype, nbrs.closed)
     kind = nbrs.box_kind

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any, ClassVar, Self, TypeGuard
+from typing import Self, TypeGuard
 
 import jax
 import jax.numpy as jnp
@@ -72,15 +72,23 @@ class Searched:
         return fold_pairs(self.inputs, self.options, elements, visit, out)
 
 
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class _OfList:
-    """What the pairs of padded and flat lists have in common."""
+    """What the pairs of padded and flat lists have in common.
 
-    __dataclass_fields__: ClassVar[dict[str, Any]]
+    Attributes:
+        mask: Which slots hold a pair, bool.
+        shifts: Of each slot, [..., d] whole floats, or None in open space.
+        source_count: Number of sources. Static.
+        symmetric: Whether exchanging i and j gives the same pairs. Static.
+        flipped: Whether i and j are exchanged: i are the sources of the list, j its rows, and shifts are negated. Static.
+    """
+
     mask: Array
     shifts: Array | None
-    source_count: int
-    symmetric: bool
-    flipped: bool
+    source_count: int = dataclasses.field(metadata={"static": True})
+    symmetric: bool = dataclasses.field(metadata={"static": True})
+    flipped: bool = dataclasses.field(default=False, metadata={"static": True})
 
     @property
     def periodic(self) -> bool:
@@ -151,25 +159,15 @@ class _OfList:
 
 
 @jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class Listed(_OfList):
     """The pairs of a padded list.
 
     Attributes:
-        idx: [m, c] int32 source indices, valid where `mask` is set.
-        mask: [m, c] bool, which slots hold a pair.
-        shifts: [m, c, d] whole floats, or None in open space.
-        source_count: Number of sources. Static.
-        symmetric: Whether exchanging i and j gives the same pairs. Static.
-        flipped: Whether i and j are exchanged: i are the sources of the list, j its rows, and shifts are negated. Static.
+        idx: [m, c] int32 source indices, valid where `mask` [m, c] is set.
     """
 
     idx: Array
-    mask: Array
-    shifts: Array | None
-    source_count: int = dataclasses.field(metadata={"static": True})
-    symmetric: bool = dataclasses.field(metadata={"static": True})
-    flipped: bool = dataclasses.field(default=False, metadata={"static": True})
 
     @property
     def _row_count(self) -> int:
@@ -197,27 +195,19 @@ class Listed(_OfList):
 
 
 @jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class Flat(_OfList):
     """The pairs of a flat list.
 
     Attributes:
-        senders: [total] int32 source indices, valid where `mask` is set.
+        senders: [total] int32 source indices, valid where `mask` [total] is set.
         receivers: [total] int32, their rows, ascending.
         offsets: [m + 1] int32, where the pairs of each row begin, and those of the last one end; they may exceed `total`.
-        mask: [total] bool, which of them are pairs.
-        shifts: [total, d] whole floats, or None in open space.
-        source_count: As in `Listed`, and so are symmetric and flipped. Static.
     """
 
     senders: Array
     receivers: Array
     offsets: Array
-    mask: Array
-    shifts: Array | None
-    source_count: int = dataclasses.field(metadata={"static": True})
-    symmetric: bool = dataclasses.field(metadata={"static": True})
-    flipped: bool = dataclasses.field(default=False, metadata={"static": True})
 
     @property
     def _row_count(self) -> int:
@@ -283,7 +273,8 @@ class Kept:
         """Return the same pairs, decided at once, for array programming."""
         given, n = self.given, self.given.sources.shape[0]
         mask, shifts = kept_mask(given), kept_shifts(given) if self.periodic else None
-        listed = Listed(given.idx, mask, shifts, n, self.symmetric, self.flipped)
+        kind = {"source_count": n, "symmetric": self.symmetric, "flipped": self.flipped}
+        listed = Listed(idx=given.idx, mask=mask, shifts=shifts, **kind)
         return dataclasses.replace(listed.mirrored(), flipped=self.flipped) if self.apart else listed
 
     def directed(self) -> KeptList:

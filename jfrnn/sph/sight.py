@@ -119,9 +119,7 @@ def look(room: Sight, tri: jfrnn.TriangleList, x: Array, normal: Array, there: A
 
 def _places(flags: Array, most: int) -> Array:
     """Return the indices of the first flags that are set, shape [most], int32, padded with their number."""
-    place = jnp.where(flags, jnp.cumsum(flags, dtype=jnp.int32) - 1, most)
-    index = jnp.arange(len(flags), dtype=jnp.int32)
-    return jnp.full(most, len(flags), jnp.int32).at[place].set(index, mode="drop", unique_indices=True)
+    return jnp.nonzero(flags, size=most, fill_value=len(flags))[0].astype(jnp.int32)
 
 
 def _ground(tri: jfrnn.TriangleList, near: Array, points: Array, ways: Array) -> Array:

@@ -24,7 +24,9 @@ struct Excluded {
     struct OfAny {
         static constexpr int WORDS = EXCLUDING ? 64 : 1;
         unsigned int bits[WORDS];
-        JFRNN_INLINE bool may_have(int id) const { return bits[id >> 5 & (WORDS - 1)] >> (id & 31) & 1; }
+        JFRNN_FUNCTION int word_of(int id) { return id >> 5 & (WORDS - 1); }
+        JFRNN_FUNCTION unsigned int bit_of(int id) { return 1u << (id & 31); }
+        JFRNN_INLINE bool may_have(int id) const { return bits[word_of(id)] & bit_of(id); }
     };
     // Writes down the row where it holds at most MOST_KEPT ids, else MANY.
     JFRNN_INLINE void keep(int* ids) const {

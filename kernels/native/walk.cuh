@@ -112,13 +112,14 @@ struct Walk : PairSearch {
         const Excluded mine(excluded_starts, excluded, lane < group.size ? group.my_id : 0);
         warp.filters[lane] = mine.filter;
         mine.keep(warp.excluded[lane]);
+        using OfAny = Excluded::OfAny;
         unsigned int* const words = warp.excluded_by_any.bits;
-        for (int w = lane; w < Excluded::OfAny::WORDS; w += 32)
+        for (int w = lane; w < OfAny::WORDS; w += 32)
             words[w] = __any_sync(ALL, mine.end - mine.begin > Excluded::SHORT) ? ALL : 0;
         __syncwarp();
         const bool is_short = lane < group.size && mine.end - mine.begin <= Excluded::SHORT;
         for (const int* id = mine.begin; is_short && id < mine.end; ++id)
-            atomicOr(words + (*id >> 5 & (Excluded::OfAny::WORDS - 1)), 1u << (*id & 31));
+            atomicOr(words + OfAny::word_of(*id), OfAny::bit_of(*id));
         __syncwarp();
     }
     // Makes rows of a matrix of the queries and, if they are sources, keeps them as the first candidates: the number is the lane.
