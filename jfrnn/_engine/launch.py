@@ -45,12 +45,14 @@ class Call(NamedTuple):
         inputs: The names of the arrays that are given.
         results: The dtypes of those that are written, by name.
         plan: Shapes of all arrays, by name, and the multiprocessors of the device (the CPU: 1) -> what is launched.
+        instead: The names of inputs in whose place results are written, by those of the results.
     """
 
     name: str
     inputs: Sequence[str]
     results: Mapping[str, Any]
     plan: Callable[[Shapes, int], Plan]
+    instead: Mapping[str, str] = {}
 
 
 _calls: dict[str, Callable[..., Call]] = {}
@@ -78,7 +80,10 @@ def _call(found: Call, recipe: str, *inputs: Array, output_dims: dict[str, Any])
     kind = _varying(inputs)
     results = [jax.ShapeDtypeStruct(_shape(output_dims[key]), dtype, **kind) for key, dtype in found.results.items()]
     name = f"{found.name}@{_sources()}@{'_'.join('x'.join(map(str, shape)) for shape in shapes)}"
-    return jax.ffi.ffi_call(TARGET, results, vmap_method="sequential")(*inputs, kernel=name, recipe=recipe)
+    names = list(found.inputs), list(found.results)
+    aliases = {names[0].index(given): names[1].index(result) for result, given in found.instead.items()}
+    call = jax.ffi.ffi_call(TARGET, results, vmap_method="sequential", input_output_aliases=aliases)
+    return call(*inputs, kernel=name, recipe=recipe)
 
 
 def _shape(dims: int | tuple[int, ...]) -> tuple[int, ...]:
@@ -177,7 +182,7 @@ def _keep_plan(name: str, recipe: str, device: int) -> None:
     with one_at_a_time:
         if (name, device) in _plans:
             return
-        laid = lay_plan(name, found.plan(shapes, multiprocessors_of(device)), list(shapes), device)
+        laid = lay_plan(name, found.plan(shapes, multiprocessors_of(device)), shapes, device)
         while len(_plans) >= _MOST:
             desk.drop(_plans.pop(next(iter(_plans))))
         _plans[name, device] = laid

@@ -3,6 +3,7 @@
 import ctypes
 import dataclasses
 import functools
+import math
 import os
 import sys
 import threading
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
 
 PLACES_PER_THREAD = 512  # below, a second thread costs more than it saves
 _HUGE = 1 << 22  # bytes from which an array is worth a request for huge pages
-_MOST_BYTES, _MOST_ARRAYS, MOST_WORDS = 1024, 48, 1024  # those of the native code
+_MOST_BYTES, _MOST_ARRAYS, MOST_WORDS, _MOST_RECORDED = 1024, 48, 1024, 8  # those of the native code
 _ONCE, _SHARED, _CUDA, _CUDA_BESIDE, _CLEAR, _HUGE_PAGES = range(6)
 _MAY_LACK = (*EXCLUDED, *TABLE, "radii", "query_radii", "grids")  # arguments that kernels name, and some of them do not read
 _STREAM = "stream"  # the name of an argument that gets the stream of the call, as if that were an array
@@ -69,12 +70,16 @@ class Plan(NamedTuple):
         numbers: Arguments of kernels, by name.
         absent: Arrays that no kernel touches, though it names them.
         keep: The number of a CUDA device, or -1 -> what is kept there for all calls, which take turns then.
+        asked: The name of an array of int32, on CUDA: the first step writes it, and others are launched if a word is not 0.
+        same: The names of arguments that are other arrays of the call, by the names of these.
     """
 
     steps: Sequence[Launch | Clear | HugePages]
     numbers: Mapping[str, int]
     absent: Sequence[str] = ()
     keep: Callable[[int], Kept] | None = None
+    asked: str | None = None
+    same: Mapping[str, str] = {}
 
 
 def share(kernel: Kernel, places: int, each: int = PLACES_PER_THREAD) -> Launch:
@@ -103,6 +108,27 @@ class _Step(ctypes.Structure):
     )
 
 
+class _Recorded(ctypes.Structure):
+    _fields_ = (
+        ("arrays", ctypes.c_void_p * _MOST_ARRAYS),
+        ("count", ctypes.c_int),
+        ("met", ctypes.c_uint),
+        ("graph", ctypes.c_void_p),
+    )
+
+
+class _Recorder(ctypes.Structure):
+    _fields_ = (
+        ("stream", ctypes.c_void_p),
+        ("context", ctypes.c_void_p),
+        ("decide", ctypes.c_void_p),
+        ("recorded", _Recorded * _MOST_RECORDED),
+        ("turn", ctypes.c_uint),
+        ("locked", ctypes.c_int),
+        ("fails", ctypes.c_int),
+    )
+
+
 class _Plan(ctypes.Structure):
     _fields_ = (
         ("name", ctypes.c_char_p),
@@ -116,6 +142,9 @@ class _Plan(ctypes.Structure):
         ("device", ctypes.c_int),
         ("step_count", ctypes.c_int),
         ("in_turns", ctypes.c_int),
+        ("asked", ctypes.c_int),
+        ("asked_words", ctypes.c_int),
+        ("recorder", ctypes.c_void_p),
     )
 
 
@@ -131,9 +160,19 @@ _OF_PYTHON = {
 }
 
 
+_OF_DRIVER = {
+    "launch": "cuLaunchKernel",
+    "clear": "cuMemsetD32Async",
+    "record": "cuEventRecord",
+    "wait": "cuStreamWaitEvent",
+    "read": "cuMemcpyDtoHAsync_v2",
+    "finish": "cuStreamSynchronize",
+}
+
+
 class _Desk(ctypes.Structure):
     _fields_ = (
-        *((name, ctypes.c_void_p) for name in ("make_plan", "yield", "advise", "launch", "clear", "record", "wait")),
+        *((name, ctypes.c_void_p) for name in ("make_plan", "yield", "advise", *_OF_DRIVER, *_driver.GRAPHS)),
         *((name, ctypes.c_void_p) for name in _OF_PYTHON),
         ("plans", ctypes.c_void_p),
         ("plan_count", ctypes.c_longlong),
@@ -153,15 +192,16 @@ class LaidPlan(NamedTuple):
     held: list[Any]
 
 
-def lay_plan(name: str, plan: Plan, arrays: list[str], device: int) -> LaidPlan:
+def lay_plan(name: str, plan: Plan, shapes: Mapping[str, tuple[int, ...]], device: int) -> LaidPlan:
     """Compile what a plan launches, and lay it down.
 
     Args:
         name: By which it is found.
         plan: What is launched.
-        arrays: The names of the arrays that a call brings, in order.
+        shapes: Those of the arrays that a call brings, in order, by name.
         device: The number of a CUDA device, or -1 for the CPU.
     """
+    arrays = list(shapes)
     if len(arrays) > _MOST_ARRAYS:
         raise ValueError(f"{name} takes {len(arrays)} arrays, more than {_MOST_ARRAYS}")
     held: list[Any] = [text := name.encode()]
@@ -169,12 +209,19 @@ def lay_plan(name: str, plan: Plan, arrays: list[str], device: int) -> LaidPlan:
         kept = plan.keep(device)
         held.append(kept)
         plan = plan._replace(numbers={**plan.numbers, **kept.addresses}, absent=[*plan.absent, *kept.addresses])
-    lay = functools.partial(_lay_step, plan, {array: k for k, array in enumerate([*arrays, _STREAM])}, device, held)
+    places = {array: k for k, array in enumerate([*arrays, _STREAM])}
+    places |= {argument: places[array] for argument, array in plan.same.items()}
+    lay = functools.partial(_lay_step, plan, places, device, held)
     laid = [lay(step) for step in plan.steps]
     warn_of_folders()
     steps = (_Step * len(laid))(*laid)
     found = _Plan(name=text, name_size=len(text), steps=ctypes.addressof(steps), device=device, step_count=len(laid))
     found.in_turns = plan.keep is not None
+    found.asked = -1 if plan.asked is None else arrays.index(plan.asked)
+    found.asked_words = 0 if plan.asked is None else math.prod(shapes[plan.asked])
+    if plan.asked is not None:
+        held.append(recorder := _make_recorder(device))
+        found.recorder = recorder and ctypes.addressof(recorder)
     if any(step.kind == _CUDA_BESIDE for step in laid):
         found.side, found.begun, found.ended = _second_stream(device)
     elif plan.keep is not None and device >= 0:
@@ -226,9 +273,8 @@ class Desk:
     def keep(self, laid: LaidPlan) -> None:
         """Let calls find a plan."""
         if laid.plan.device >= 0 and not self._desk.launch:
-            driver, desk = _driver.driver(), self._desk
-            desk.launch, desk.clear = _address(driver, "cuLaunchKernel"), _address(driver, "cuMemsetD32Async")
-            desk.record, desk.wait = _address(driver, "cuEventRecord"), _address(driver, "cuStreamWaitEvent")
+            for name, function in (_OF_DRIVER | _driver.GRAPHS).items():
+                setattr(self._desk, name, _address(_driver.driver(), function))
         self._keep(ctypes.addressof(laid.plan))
 
     def drop(self, laid: LaidPlan) -> None:
@@ -286,6 +332,19 @@ def _second_stream(device: int) -> tuple[int, int, int]:
     """Return a stream of a CUDA device, and two events, for launches that run beside others."""
     found = _driver.find_device(device)
     return _driver.make_stream(found), _driver.make_event(found), _driver.make_event(found)
+
+
+def _make_recorder(device: int) -> _Recorder | None:
+    """Return what records launches on a CUDA device behind a condition; None where its driver cannot."""
+    found = _driver.find_device(device)
+    decide = _driver.find_decider(found)
+    return None if decide is None else _Recorder(stream=_recording_stream(device), context=found.context, decide=decide)
+
+
+@functools.cache
+def _recording_stream(device: int) -> int:
+    """Return a stream of a CUDA device on which nothing ever runs."""
+    return _driver.make_stream(_driver.find_device(device))
 
 
 @functools.cache

@@ -106,7 +106,7 @@ class WarpEngine:
         """Return the scratch that the kernels are given [B]."""
         check_platform(self.name, platform)
         cells = _CELLS[PLATFORMS[platform]]
-        if 0 in (n, m) or (cells is cells_cuda and _all_meet((n, m), scaled)):
+        if 0 in (n, m) or (cells is cells_cuda and all_meet((n, m), scaled)):
             return 0
         return 4 * cells.scratch_words(n, m, dim, 2 if double else 1, own)
 
@@ -164,10 +164,11 @@ def _order_in(module: ModuleType, search: Search, scratch: Array) -> Array:
 
 def are_few(search: Search) -> bool:
     """Say whether particles are so few that on CUDA all of them meet, in one launch."""
-    return periodic_kind(search.torus) <= 1 and _all_meet(search.sizes, search.cutoff.scaled)
+    return periodic_kind(search.torus) <= 1 and all_meet(search.sizes, search.cutoff.scaled)
 
 
-def _all_meet(sizes: tuple[int, int], scaled: bool) -> bool:
+def all_meet(sizes: tuple[int, int], scaled: bool) -> bool:
+    """Say whether on CUDA all sources and queries meet, of so many."""
     return not scaled and max(sizes) <= few_cuda.MOST
 
 
@@ -248,7 +249,7 @@ def _tree_callable(variant: Variant) -> Call:
 
 @kernel
 def _cuda_callable(variant: Variant) -> Call:
-    return describe_call("cells_cuda", variant, functools.partial(_plan_on_cuda, variant), cutoffs=names_of_particles)
+    return describe_call("cells_cuda", variant, functools.partial(plan_on_cuda, variant), cutoffs=names_of_particles)
 
 
 @kernel
@@ -258,10 +259,11 @@ def _tree_on_cuda(variant: Variant) -> Call:
 
 @kernel
 def _few_callable(variant: Variant) -> Call:
-    return describe_call("few_cuda", variant, functools.partial(_plan_few, variant))
+    return describe_call("few_cuda", variant, functools.partial(plan_few, variant))
 
 
-def _plan_on_cuda(variant: Variant, shapes: Shapes, multiprocessors: int) -> Plan:
+def plan_on_cuda(variant: Variant, shapes: Shapes, multiprocessors: int) -> Plan:
+    """Return what is launched for a search among cells."""
     kind = {"periodic": variant.periodic, "batched": variant.batched, "excluding": variant.excluding, "flat": variant.flat}
     kind |= {"rule": variant.rule}
     dim, later = variant.dim, variant.keep.later_only
@@ -290,7 +292,8 @@ def fit_tree(fit: Kernel, numbers: Mapping[str, int]) -> list[Clear | Launch]:
     return [*clear, *(Launch(fit, each, {"level": level}) for level, each in enumerate(threads))]
 
 
-def _plan_few(variant: Variant, shapes: Shapes, _: int) -> Plan:
+def plan_few(variant: Variant, shapes: Shapes, _: int) -> Plan:
+    """Return what is launched for a search in which all particles meet."""
     numbers = plan_numbers(variant, shapes)
     numbers["drop_self"] &= variant.own
     query = few_cuda.rows_kernel(

@@ -75,4 +75,4 @@ from jfrnn._geometry.motion import box_change, motion_of, turns_between
 from jfrnn._geometry.order import hilbert_order, sort_order
 from jfrnn._geometry.status import NeighborOverflowError, Status, known_status, names_of_bits, pairs_and_status, shape_of, tell
 from jfrnn._geometry.tree_order import CLASSES, order_for_tree
-from jfrnn._geometry.wrapping import NOT_FINITE, TOO_FAR, Wrapped, unpack_turns, wrap
+from jfrnn._geometry.wrapping import NOT_FINITE, TOO_FAR, Wrapped, bound_wrapping, unpack_turns, wrap

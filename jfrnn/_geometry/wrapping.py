@@ -91,7 +91,7 @@ def wrap(
     transform| <= |d|·|column of the transform|. `reach` is the sum of these terms, each rounded up generously.
     """
     dtype, images, dim = np.dtype(sources.dtype), lattice.images, lattice.dim
-    eps, periodic = jnp.finfo(dtype).eps, lattice.spread(lattice.periodic, lattice.origin.ndim)
+    periodic = lattice.spread(lattice.periodic, lattice.origin.ndim)
     clouds = [sources] if queries is None else [sources, queries]
     lattices = [lattice] * len(clouds) if batch is None else [lattice.of_rows(x) for x in (batch.sources, batch.of_queries)]
     packed, wrapped = [pack_turns(points, each) for points, each in zip(clouds, lattices, strict=False)], []
@@ -102,15 +102,36 @@ def wrap(
     met = functools.reduce(jnp.bitwise_or, (_met(turns, dim) for turns in packed))
     most = (met & LARGEST_TURN).astype(dtype)  # at least the largest number of turns, and less than twice that
 
+    largest = None
+    if not (images.orthogonal or (lattice.flags is None and np.all(periodic))):
+        largest = functools.reduce(jnp.maximum, _largest_finite(wrapped, batch, len(lattice.matrix)))
+    bounds = bound_wrapping(most, lattice, radius, batch is not None, largest)
+    return Wrapped(wrapped[0], wrapped[-1], packed[0], packed[-1], *bounds, met)
+
+
+class Bounds(NamedTuple):
+    """The fields of `Wrapped` that follow from a lattice, a radius and the most turns."""
+
+    slack: Array
+    reach: Array
+    margin: Array
+    enough: Array
+
+
+def bound_wrapping(
+    most: Array, lattice: Lattice, radius: np.floating | Array, per_system: bool = False, largest: Array | None = None
+) -> Bounds:
+    """Bound the rounding errors of wrapping by at most `most` turns; `largest` coordinates, where lattices do not tell them."""
+    dtype, images = np.dtype(lattice.matrix.dtype), lattice.images
+    eps, periodic = jnp.finfo(dtype).eps, lattice.spread(lattice.periodic, lattice.origin.ndim)
     matrix, transform = jnp.abs(lattice.matrix), jnp.abs(lattice.transform)
     spans = add_rows(matrix)
     size = jnp.abs(lattice.origin) + (most + 1) * spans  # largest coordinate so many lattice vectors away
-    if not (images.orthogonal or (lattice.flags is None and np.all(periodic))):
-        size = size + functools.reduce(jnp.maximum, _largest_finite(wrapped, batch, len(spans)))
+    size = size if largest is None else size + largest
     residual = lattice.residual + 8 * eps * product(matrix, transform)
     length = jnp.sqrt(add_rows((transform * radius) ** 2)) * (1 + 16 * eps)
     most_shifts = jnp.asarray(max(images.reach), dtype)
-    if batch is not None:  # those of each system alone
+    if per_system:  # those of each system alone
         most_shifts = jnp.minimum(most_shifts, jnp.ceil(largest_component(length)[..., None]) + 1)
     shifts = most + most_shifts + 1
     rounding = 8 * eps * product(size[..., None, :], transform)[..., 0, :] + 2 * shifts * add_rows(residual)
@@ -122,7 +143,7 @@ def wrap(
     limit = jnp.where(periodic, 0.5 if images.nearest else most_images, jnp.inf)
     enough = (reach < limit).all(axis=-1) if images.nearest else (reach <= limit).all(axis=-1)
     slack = _wrapping_error(most, most_shifts, lattice)
-    return Wrapped(wrapped[0], wrapped[-1], packed[0], packed[-1], slack, reach, margin, enough, met)
+    return Bounds(slack, reach, margin, enough)
 
 
 def _wrapping_error(most: Array, reach: Array, lattice: Lattice) -> Array:

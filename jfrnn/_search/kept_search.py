@@ -45,7 +45,7 @@ from jfrnn._search.kept_options import KeptOptions
 from jfrnn._search.problem import Problem
 from jfrnn._search.reverse import Reverse
 from jfrnn._search.verlet import Verlet, has_moved_too_far
-from jfrnn._tracing import Flags, Given, Numbers, Points, Real, call_apart, compile_program, own_transfers
+from jfrnn._tracing import Flags, Given, Numbers, Points, Real, call_apart, compile_program, on_platform, own_transfers
 
 Kept = TypeVar("Kept", bound="KeptSearch")
 
@@ -85,6 +85,15 @@ class KeptSearch(KeptOptions):
 
     @property
     def _row_count(self) -> int:
+        raise NotImplementedError
+
+    def _may_renew(self, inputs: Inputs) -> bool:
+        """Say whether on CUDA kernels decide whether the list is made anew, and make it."""
+        del inputs
+        return False
+
+    def _renew(self, inputs: Inputs) -> Self:
+        """Let kernels decide whether the list is made anew, and make it."""
         raise NotImplementedError
 
     def _find(self, inputs: Inputs, room: int) -> dict[str, Any]:
@@ -188,13 +197,13 @@ class KeptSearch(KeptOptions):
             ValueError, TypeError: an argument does not fit the list.
 
         Cost: one pass over the positions, or a search. Differentiable: no gradient flows through. Jit: yes. vmap: yes; if any list
-        of the batch is stale, all are rebuilt.
+        of the batch is stale, others may be rebuilt with it.
         """
-        sources, rows, box = self._geometry_inputs(positions, queries, box)
+        sources, rows, now = self._geometry_inputs(positions, queries, box)
         rows = rows if self.own_queries else None
         radii, active = self._radii_now(cutoff, sources, rows), self._check_active(active, sources)
         with own_transfers():
-            return call_apart(_update, self, sources, rows, active, box, radii)
+            return call_apart(_update, self, sources, rows, active, None if box is None else now, radii)
 
     def grow(
         self,
@@ -317,17 +326,29 @@ def _replace(nbrs: Kept, **fields: object) -> Kept:
 
 @compile_program
 def _update(nbrs: Kept, sources: Array, queries: Array | None, active: Array | None, box: Box | None, radii: Radii | None) -> Kept:
+    """Make a list anew if it is stale; without a box, in its own."""
+    stays, box = box is None, nbrs.box if box is None else box
     sources, queries, box, radii = lax.stop_gradient((sources, queries, box, radii))
     inputs = nbrs.problem.inputs(sources, queries, active, box, radii, nbrs.batch, nbrs.exclude)
-
-    def remake(nbrs: Kept) -> Kept:
-        made, verlet = _remake(nbrs, inputs, nbrs._room), nbrs.verlet
-        if made.verlet is not None and verlet is not None:
-            made = _replace(made, verlet=dataclasses.replace(made.verlet, rebuild_count=verlet.rebuild_count + 1))
-        return _replace(made, status=made.status | nbrs.status, required=jnp.maximum(made.required, nbrs.required))
-
     if nbrs.verlet is None:
-        return remake(nbrs)
+        return _make_again(nbrs, inputs)
+    if stays and nbrs._may_renew(inputs):
+        return on_platform(nbrs, inputs, cuda=type(nbrs)._renew, default=_make_again_if_stale)
+    return _make_again_if_stale(nbrs, inputs)
+
+
+def _make_again(nbrs: Kept, inputs: Inputs) -> Kept:
+    made, verlet = _remake(nbrs, inputs, nbrs._room), nbrs.verlet
+    if made.verlet is not None and verlet is not None:
+        made = _replace(made, verlet=dataclasses.replace(made.verlet, rebuild_count=verlet.rebuild_count + 1))
+    return _replace(made, status=made.status | nbrs.status, required=jnp.maximum(made.required, nbrs.required))
+
+
+def _make_again_if_stale(nbrs: Kept, inputs: Inputs) -> Kept:
+    """Let XLA decide: the host learns whether the list is stale."""
+    assert nbrs.verlet is not None
+    sources, queries, _, box = inputs[:4]
+    radii = inputs.cutoff if isinstance(inputs.cutoff, Radii) else None
     now = hide_inactive(sources, take_present(inputs).active)
     moved = has_moved_too_far(nbrs.verlet, now, queries, box, nbrs.box_kind, radii, nbrs.skin, nbrs.batch)
     fixed = {"box": box, "radii": radii, "batch": nbrs.batch, "exclude": nbrs.exclude}
@@ -335,7 +356,7 @@ def _update(nbrs: Kept, sources: Array, queries: Array | None, active: Array | N
     state = moved, _replace(nbrs, **nobody)
 
     def body(state: tuple[Array, Kept]) -> tuple[Array, Kept]:
-        return jnp.zeros_like(state[0]), _replace(remake(state[1]), **nobody)
+        return jnp.zeros_like(state[0]), _replace(_make_again(state[1], inputs), **nobody)
 
     # a loop of at most one iteration: XLA updates a loop's carry in place, but copies the results of a branch
     return _replace(lax.while_loop(lambda state: state[0], body, state)[1], **fixed)

@@ -10,12 +10,14 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
-from jfrnn._engine import Inputs, Options
+from jfrnn._engine import Inputs, KeptRows, Options, can_renew, renew_list
 from jfrnn._geometry import (
     Box,
     Status,
+    make_cutoff,
     pairs_and_status,
     shape_of,
+    widen,
 )
 from jfrnn._search.edges import Edges, Graph, flat_edges, make_graph, no_edges
 from jfrnn._search.exports import check_held, check_total, pair_total
@@ -258,6 +260,21 @@ class NeighborList(ListExports):
 
     def _find(self, inputs: Inputs, room: int) -> dict[str, Any]:
         return find_fields(inputs, self.problem.options, room, self.skin > 0, self.reverse is not None)
+
+    def _may_renew(self, inputs: Inputs) -> bool:
+        plain = self.reverse is None and self.images is None
+        return plain and can_renew(inputs, self.problem.options, self.capacity)
+
+    def _renew(self, inputs: Inputs) -> "NeighborList":
+        verlet, half = self.verlet, make_cutoff(self.skin / 2, self.dtype, closed=False)
+        assert verlet is not None
+        limit = half.inside if self.box is None else widen(half, jnp.zeros((), self.dtype)).inside
+        of_time = verlet.rebuild_count, verlet.positions, verlet.box
+        kept = lax.stop_gradient(KeptRows(self.idx, self.count, self.status, self.required, *of_time, self.order))
+        new = renew_list(inputs, self.problem.options, kept, limit)
+        verlet = dataclasses.replace(verlet, positions=new.reference, box=new.box, rebuild_count=new.rebuild_count)
+        found = {"idx": new.idx, "count": new.counts, "status": new.status, "required": new.required, "order": new.order}
+        return dataclasses.replace(self, **found, verlet=verlet)
 
     def _geometry(self, positions: Points, queries: Points | None, box: Box | None) -> tuple[Array, Array, Array | None]:
         return self._geometry_of(*self._geometry_inputs(positions, queries, box), as_given=True)

@@ -135,10 +135,12 @@ struct Work {
     const Plan& plan;
     void* const stream;
     void* arrays[MOST_ARRAYS + 1];  // behind them the stream
+    const int count;
     const Turn turn;
 
-    Work(const Call& given, const Plan& found, void* of_call) : call(given), plan(found), stream(of_call), turn(found) {
-        arrays[call.arrays(arrays)] = stream;
+    Work(const Call& given, const Plan& found, void* of_call)
+        : call(given), plan(found), stream(of_call), count(given.arrays(arrays)), turn(found) {
+        arrays[count] = stream;
     }
 
     void fill(const Step& step, unsigned char* bytes) const {
@@ -153,15 +155,15 @@ struct Work {
         const unsigned int blocks = (unsigned int)((step.threads + step.block - 1) / step.block);
         return blocks ? desk->launch(step.function, blocks, 1, 1, (unsigned int)step.block, 1, 1, 0, on, arguments, nullptr) : 0;
     }
-    // Launches a step and the one behind it, which waits for what came before both alone.
-    int launch_both(const Step* step) const {
-        const Lock lock(&desk->forking);  // the second stream and its events are those of all calls on a device
-        int wrong = desk->record(plan.begun, stream);
+    // Launches a step and the one behind it, which waits for what came before both alone. The second stream and its events are those
+    // of all calls on a device.
+    int launch_both(const Step* step, void* on) const {
+        int wrong = desk->record(plan.begun, on);
         wrong = wrong ? wrong : desk->wait(plan.side, plan.begun, 0);
-        wrong = wrong ? wrong : launch(step[0], stream);
+        wrong = wrong ? wrong : launch(step[0], on);
         wrong = wrong ? wrong : launch(step[1], plan.side);
         wrong = wrong ? wrong : desk->record(plan.ended, plan.side);
-        return wrong ? wrong : desk->wait(stream, plan.ended, 0);
+        return wrong ? wrong : desk->wait(on, plan.ended, 0);
     }
     void run_once(const Step& step) const {
         alignas(16) unsigned char bytes[MOST_BYTES];
@@ -169,27 +171,123 @@ struct Work {
         ((Function)step.function)(bytes);
     }
     int run_on_cuda() const {
+        if (plan.asked >= 0)
+            return run_if_asked();
         if (!plan.in_turns)
-            return launch_all();
+            return launch_all(0);
         int wrong = desk->wait(stream, plan.ended, 0);  // for calls before, on other streams
-        wrong = wrong ? wrong : launch_all();
+        wrong = wrong ? wrong : launch_all(0);
         const int lost = desk->record(plan.ended, stream);
         return wrong ? wrong : lost;
     }
-    int launch_all() const {
+    int launch_all(int first) const {
         int wrong = 0;
-        for (int k = 0; k < plan.step_count && !wrong; ++k) {
-            const Step& step = plan.steps[k];
-            if (step.kind == CLEAR)
-                wrong = desk->clear((unsigned long long)arrays[step.arrays[1]], 0, (size_t)step.threads / 4, stream);
-            else if (step.kind == ONCE)
-                run_once(step);
-            else if (k + 1 < plan.step_count && plan.steps[k + 1].kind == CUDA_BESIDE)
-                wrong = launch_both(plan.steps + k++);
-            else
-                wrong = launch(step, stream);
+        for (int k = first; k < plan.step_count && !wrong; ++k) {
+            const bool forks = is_forked(k);
+            const Lock lock(forks ? &desk->forking : nullptr);
+            wrong = forks ? launch_both(plan.steps + k++, stream) : begin(plan.steps[k], stream);
         }
         return wrong;
+    }
+    bool is_forked(int k) const { return k + 1 < plan.step_count && plan.steps[k + 1].kind == CUDA_BESIDE; }
+    int begin(const Step& step, void* on) const {
+        if (step.kind == CLEAR)
+            return desk->clear((unsigned long long)arrays[step.arrays[1]], 0, (size_t)step.threads / 4, on);
+        if (step.kind != ONCE)
+            return launch(step, on);
+        run_once(step);
+        return 0;
+    }
+    // The first step, and the others if they are asked for. The host reads whether they are, and waits, where arrays stand at
+    // addresses that were not met lately; where they were, as in a loop, the device decides: launches are recorded in a graph.
+    int run_if_asked() const {
+        int wrong = 0;
+        if (plan.recorder != nullptr && runs_recorded(*plan.recorder, wrong))
+            return wrong;
+        int words[MOST_ASKED], asked = 0;
+        wrong = begin(plan.steps[0], stream);
+        wrong = wrong ? wrong : desk->read(words, (unsigned long long)arrays[plan.asked], (size_t)plan.asked_words * 4, stream);
+        wrong = wrong ? wrong : desk->finish(stream);
+        for (int k = 0; k < plan.asked_words && !wrong; ++k)
+            asked |= words[k];
+        return wrong || !asked ? wrong : launch_all(1);
+    }
+    bool runs_recorded(Recorder& recorder, int& wrong) const {
+        const Lock lock(&recorder.locked);
+        Recorded* oldest = recorder.recorded;
+        ++recorder.turn;
+        for (Recorded& each : recorder.recorded) {
+            bool same = each.count == count;
+            for (int k = 0; same && k < count; ++k)
+                same = each.arrays[k] == arrays[k];
+            if (same) {
+                each.met = recorder.turn;
+                if (each.graph == nullptr && !recorder.fails) {
+                    each.graph = record(recorder);
+                    recorder.fails = each.graph == nullptr;
+                }
+                wrong = each.graph == nullptr ? 0 : desk->run_graph(each.graph, stream);
+                return each.graph != nullptr;
+            }
+            if (each.met - recorder.turn < oldest->met - recorder.turn)
+                oldest = &each;
+        }
+        if (oldest->graph != nullptr)
+            desk->drop_ready(oldest->graph);
+        oldest->graph = nullptr;
+        oldest->count = count;
+        oldest->met = recorder.turn;
+        memcpy(oldest->arrays, arrays, (size_t)count * sizeof(void*));
+        return false;
+    }
+    // Returns a graph of the first step, and of the others behind a condition; none where the driver cannot make it.
+    void* record(const Recorder& recorder) const {
+        void *graph = nullptr, *ready = nullptr;
+        const Lock lock(&desk->forking);  // these streams are those of all calls on a device
+        if (desk->make_graph(&graph, 0))
+            return nullptr;
+        if (record_into(recorder, graph) || desk->make_ready(&ready, graph, 0))
+            ready = nullptr;
+        desk->drop_graph(graph);
+        return ready;
+    }
+    int record_into(const Recorder& recorder, void* graph) const {
+        // CUgraphNodeParams of a conditional node
+        struct Condition {
+            int type = 13, reserved[3] = {};
+            unsigned long long condition = 0;
+            int kind = 0;  // if
+            unsigned int size = 1;
+            void** bodies = nullptr;
+            void* context = nullptr;
+            long long rest[26] = {};
+        } node;
+        static_assert(sizeof(Condition) == 256, "CUgraphNodeParams");
+        node.context = recorder.context;
+        int wrong = desk->make_condition(&node.condition, graph, recorder.context, 0, 1);
+        struct {
+            unsigned long long condition;
+            void* words;
+            int count;
+        } given = {node.condition, arrays[plan.asked], plan.asked_words};
+        void *before[4], *conditional = nullptr, *arguments[3] = {&given.condition, &given.words, &given.count};
+        size_t count_before = 4;
+        wrong = wrong ? wrong : desk->begin_record(recorder.stream, graph, nullptr, nullptr, 0, 2);
+        if (wrong)
+            return wrong;
+        wrong = begin(plan.steps[0], recorder.stream);
+        wrong = wrong ? wrong : desk->launch(recorder.decide, 1, 1, 1, 256, 1, 1, 0, recorder.stream, arguments, nullptr);
+        int lost = desk->end_record(recorder.stream, &graph);
+        wrong = wrong ? wrong : lost;
+        wrong = wrong ? wrong : desk->nodes_of(graph, before, &count_before);
+        wrong = wrong ? wrong : desk->add_node(&conditional, graph, before, count_before, &node);
+        wrong = wrong ? wrong : desk->begin_record(recorder.stream, node.bodies[0], nullptr, nullptr, 0, 2);
+        if (wrong)
+            return wrong;
+        for (int k = 1; k < plan.step_count && !wrong; ++k)
+            wrong = is_forked(k) ? launch_both(plan.steps + k++, recorder.stream) : begin(plan.steps[k], recorder.stream);
+        lost = desk->end_record(recorder.stream, node.bodies);
+        return wrong ? wrong : lost;
     }
     void run_on_cpu() const {
         alignas(16) unsigned char bytes[MOST_BYTES];
@@ -291,5 +389,9 @@ void drop_plan(Plan* plan) {
     }
     while (__atomic_load_n(&plan->users, __ATOMIC_ACQUIRE))
         desk->yield();
+    if (plan->recorder)
+        for (Recorded& each : plan->recorder->recorded)
+            if (each.graph)
+                desk->drop_ready(each.graph);
 }
 }

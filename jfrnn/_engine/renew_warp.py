@@ -1,0 +1,136 @@
+"""Lists with a skin on CUDA that renew themselves where they are stale: one call, which tells the host nothing.
+
+The device decides (`kernels/native/launch.h`): kernels say whether a point has moved too far, and what is launched behind them, a
+search and what stands around it, runs if one has.
+"""
+
+import functools
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from jfrnn._engine.auto import platform_of
+from jfrnn._engine.launch import Call, Shapes, kernel
+from jfrnn._engine.operands import MOST_IN_BOX, lattice_numbers
+from jfrnn._engine.plans import Launch, Plan
+from jfrnn._engine.problem import Inputs, Options
+from jfrnn._engine.variants import Variant, describe_call
+from jfrnn._engine.warp import PLATFORMS, WarpEngine, all_meet, plan_few, plan_on_cuda
+from jfrnn._geometry import Box, Cutoff, Status, bound_wrapping, is_valid, make_lattice
+from jfrnn.kernels import cells_cuda, few_cuda, renew
+
+_BITS = Status.NONFINITE.value, Status.OUT_OF_RANGE.value, Status.BOX_TOO_SMALL.value
+_KEPT = ("idx", "counts", "status", "required", "rebuild_count", "reference")
+_KEPT_OF_BOX = ("kept_vectors", "kept_origin")
+
+
+class KeptRows(NamedTuple):
+    """What a list keeps from step to step.
+
+    Attributes:
+        idx, counts: Its rows, [n, capacity] and [n] int32.
+        status, required, rebuild_count: [] int32.
+        reference: Where points were when it was made [length], [n, d].
+        box: The box of that time, or None.
+        order: In which sources follow each other in space, [n] int32, or None.
+    """
+
+    idx: Array
+    counts: Array
+    status: Array
+    required: Array
+    rebuild_count: Array
+    reference: Array
+    box: Box | None
+    order: Array | None
+
+
+def can_renew(inputs: Inputs, options: Options, capacity: int) -> bool:
+    """Say whether such a list renews itself: one of all particles, with one cutoff, in open space or a box along the axes."""
+    if PLATFORMS.get(platform_of(inputs.sources)) != "cuda":
+        return False
+    images, cutoff = options.images, inputs.cutoff
+    plain = isinstance(options.engine, WarpEngine) and isinstance(cutoff, Cutoff) and not cutoff.scaled
+    alone = all(x is None for x in (inputs.queries, inputs.active, inputs.batch, inputs.exclude))
+    boxed = images is None or (images.nearest and images.orthogonal and not images.counts_short and not images.per_system)
+    n = inputs.sources.shape[0]
+    return plain and alone and boxed and capacity > 0 and 0 < n < MOST_IN_BOX
+
+
+def numbers_of_box(inputs: Inputs, options: Options) -> Array:
+    """Return what a search in a box is given, and whether pairs have no other images: a row for each of `renew.MOST_TURNS`."""
+    box, images, dtype = inputs.box, options.images, np.dtype(inputs.sources.dtype)
+    if box is None or images is None:
+        raise TypeError("this search has no box.")
+    lattice, radius = make_lattice(box, images, dtype), jnp.asarray(_one_cutoff(inputs).radius, dtype)
+
+    def row(most: Array) -> Array:
+        bounds = bound_wrapping(most, lattice, radius)
+        whole = (bounds.enough & is_valid(lattice)).astype(dtype)
+        return jnp.concatenate([radius[None], lattice_numbers(lattice, bounds.reach, bounds.slack), whole[None]])
+
+    return jax.vmap(row)(jnp.asarray(renew.MOST_TURNS, dtype))
+
+
+def renew_list(inputs: Inputs, options: Options, kept: KeptRows, limit: np.floating | Array) -> KeptRows:
+    """Return a list that holds at these positions: the same one if no point has moved by the root of `limit`, in the same box."""
+    now, box, cutoff, ordered = inputs.sources, inputs.box, _one_cutoff(inputs), kept.order is not None
+    (n, dim), dtype = now.shape, np.dtype(now.dtype)
+    few, blocks = all_meet((n, n), False), renew.blocks(n)
+    variant = Variant(dim, dtype == np.float64, False, True, True, cutoff.closed, options.filter, int(box is not None))
+    written: dict[str, Any] = dict(zip(_KEPT, kept[: len(_KEPT)], strict=True))
+    made: dict[str, int | tuple[int, ...]] = {}
+    operands = [now, jnp.full(1, limit, dtype)]
+    if box is None:
+        operands.append(jnp.full(1, cutoff.radius, dtype))
+    else:
+        numbers = numbers_of_box(inputs, options)
+        operands += [numbers, *(jnp.asarray(x, dtype) for x in (box.vectors, box.origin))]
+        written |= dict(zip(_KEPT_OF_BOX, jax.tree.leaves(kept.box), strict=True))
+        made = {"positions": (n, dim + 1), "cutoff": numbers.shape[1] - 1}
+    written |= {"order": kept.order} if ordered else {}
+    words = (few_cuda if few else cells_cuda).scratch_words(n, n, dim, 2 if variant.double else 1, True)
+    made |= {"info": (few_cuda.blocks(n) if few else 1, 2), "scratch": max(words, 1), "stale": blocks, "parts": (blocks, 2)}
+    dims = {name: x.shape for name, x in written.items()} | made
+    found = _renew_callable(variant, few, ordered)(*operands, *written.values(), output_dims=dims)
+    new = dict(zip(written, found, strict=False))
+    leaves = [new[name] for name in _KEPT_OF_BOX if name in new]
+    at_that_time = jax.tree.unflatten(jax.tree.structure(kept.box), leaves)
+    return KeptRows(**{name: new[name] for name in _KEPT}, box=at_that_time, order=new.get("order"))
+
+
+def _one_cutoff(inputs: Inputs) -> Cutoff:
+    if not isinstance(inputs.cutoff, Cutoff):
+        raise TypeError("these lists have one cutoff.")
+    return inputs.cutoff
+
+
+@kernel
+def _renew_callable(variant: Variant, few: bool, ordered: bool) -> Call:
+    boxed, real = variant.periodic > 0, np.float64 if variant.double else np.float32
+    floats = ["reference", *_KEPT_OF_BOX * boxed, *["positions", "cutoff"] * boxed]
+    kept = [*_KEPT, *_KEPT_OF_BOX * boxed, *["order"] * ordered]
+    results = [*kept, *["positions", "cutoff"] * boxed, "info", "scratch", "stale", "parts"]
+    given = ["now", "limit", *(["cutoffs", "vectors", "origin"] if boxed else ["cutoff"])]
+    before = {name: f"{name} before" for name in kept}
+    plan = functools.partial(_plan, variant, few, ordered)
+    search = describe_call(f"renew_{'few' if few else 'cells'}{'_ordered' * ordered}", variant, plan)
+    types = {name: real if name in floats else np.int32 for name in results}
+    return Call(search.name, [*given, *before.values()], types, plan, before)
+
+
+def _plan(variant: Variant, few: bool, ordered: bool, shapes: Shapes, multiprocessors: int) -> Plan:
+    """Return what says whether the list is stale, and what is launched then."""
+    n, boxed = shapes["now"][0], variant.periodic > 0
+    same = {"count": "counts"} | ({"queries": "positions"} if boxed else {"positions": "now", "queries": "now"})
+    search = (plan_few if few else plan_on_cuda)(variant, dict(shapes) | {"positions": (n,), "queries": (n,)}, multiprocessors)
+    around = renew.renew_kernels(variant.dim, variant.double, boxed, ordered, _BITS)
+    blocks = renew.blocks(n)
+    check, prepare, keep = (Launch(each, blocks * renew.BLOCK) for each in (around.check, around.prepare, around.keep))
+    steps = [check, prepare, Launch(around.settle, renew.BLOCK), *search.steps, keep]
+    numbers = {**search.numbers, "blocks": blocks, "answers": shapes["info"][0]}
+    lacking = [*["order"] * (not ordered), *["cutoffs", "vectors", "origin", *_KEPT_OF_BOX] * (not boxed)]
+    return search._replace(steps=steps, numbers=numbers, absent=[*search.absent, *lacking], asked="stale", same=same)

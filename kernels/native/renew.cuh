@@ -1,0 +1,214 @@
+// A list with a skin on CUDA, that is renewed where it is stale: whether it is, what a search is given then, and what is left behind.
+//
+// The lists of all steps stand in the same arrays: what is kept is written only where a list is stale. A periodic box stands along the
+// axes, and a pair has one image in it. Of a box that has changed since, nothing is known but that.
+#pragma once
+#include "band.h"
+#include "lattice.h"
+
+struct RenewArguments {
+    const real* now;                               // [n, DIM], read, as all that follows but for what is kept and scratch
+    const real* limit;                             // [1] the square of a motion below which a list holds
+    const real* cutoffs;                           // [MOST_TURNS + 2, LATTICE_END + 1] what a search is given, by most turns; valid
+    const real *vectors, *origin;                  // [DIM] of the box
+    const int *info, *scratch;                     // what the search has found
+    real *reference, *kept_vectors, *kept_origin;  // kept: [n, DIM] and [DIM]
+    int *status, *required, *rebuild_count, *order;  // kept: [1], and [n]
+    real *positions, *cutoff;                        // scratch: [n, ROW] and [LATTICE_END], what the search is given
+    int *stale, *parts;                              // scratch: [blocks] and [blocks, 2]
+    int n, blocks, answers;                          // `info` has a row for each of so many answers
+};
+
+struct Renew : RenewArguments {
+    enum { STEP = 256, FAR = 192, LARGEST_TURN = 511, NOT_FINITE = 1 << 10, TOO_FAR = 2 << 10 };
+    const Lattice lattice;
+
+    JFRNN_MEMBER explicit Renew(const RenewArguments& given) : RenewArguments(given), lattice(given.cutoffs) {}
+
+    // Says for each block whether one of its points has moved too far, or may have by rounding.
+    JFRNN_MEMBER void check() const {
+        bool found = false;
+        for (int k = 0; PERIODIC && k < DIM; ++k)
+            found |= vectors[k] != kept_vectors[k] || origin[k] != kept_origin[k];
+        for (long long i = thread_index(); i < n; i += (long long)blocks * BLOCK)
+            found |= has_moved(i);
+        found = __syncthreads_or(found);
+        if (threadIdx.x == 0)
+            stale[blockIdx.x] = found;
+    }
+    // Writes down what the search is given of points, and which of them follow the one before at most a cutoff away.
+    JFRNN_MEMBER void prepare() const {
+        __shared__ int met, near;
+        if (threadIdx.x == 0)
+            met = near = 0;
+        __syncthreads();
+        int own_met = 0, own_near = 0;
+        for (long long i = thread_index(); i < n; i += (long long)blocks * BLOCK) {
+            real point[3], next[3];
+            take(i, point);
+            for (int k = 0; k < DIM; ++k)
+                reference[DIM * i + k] = point[k];
+            if constexpr (PERIODIC)
+                own_met |= write_row(i, point);
+            if (ORDERED && i + 1 < n) {
+                take(i + 1, next);
+                bool close = true;
+                for (int k = 0; k < DIM; ++k)
+                    close &= fabs(next[k] - point[k]) <= (PERIODIC ? cutoffs[0] : cutoff[0]);
+                own_near += close;
+            }
+        }
+        if (own_met)
+            atomicOr(&met, own_met);
+        if (ORDERED && own_near)
+            atomicAdd(&near, own_near);
+        __syncthreads();
+        if (threadIdx.x == 0) {
+            parts[2 * blockIdx.x] = met;
+            parts[2 * blockIdx.x + 1] = near;
+        }
+    }
+    // One block: adds up what all of them have met, and chooses what the search is given.
+    JFRNN_MEMBER void settle() const {
+        __shared__ int met, near;
+        if (threadIdx.x == 0)
+            met = near = 0;
+        __syncthreads();
+        for (int k = threadIdx.x; k < blocks; k += BLOCK) {
+            atomicOr(&met, parts[2 * k]);
+            atomicAdd(&near, parts[2 * k + 1]);
+        }
+        __syncthreads();
+        if constexpr (PERIODIC) {
+            const real* row = cutoffs + row_of(met) * (LATTICE_END + 1);
+            for (int k = threadIdx.x; k < LATTICE_END; k += BLOCK)
+                cutoff[k] = row[k];
+        }
+        if (threadIdx.x == 0) {
+            parts[0] = met;
+            parts[1] = near;
+        }
+        for (int k = threadIdx.x; PERIODIC && k < DIM; k += BLOCK) {
+            kept_vectors[k] = vectors[k];
+            kept_origin[k] = origin[k];
+        }
+    }
+    // Leaves what the search has found, apart from rows.
+    JFRNN_MEMBER void keep() const {
+        const int met = parts[0];
+        if constexpr (ORDERED)
+            for (long long i = thread_index(); i < n; i += (long long)blocks * BLOCK)
+                order[i] = parts[1] > n / 2 ? -1 : scratch[FIRST_PLACE + PLACE_WORDS * i + PLACE_WORD];
+        if (blockIdx.x > 0)
+            return;
+        __shared__ int longest, bits;
+        if (threadIdx.x == 0)
+            longest = bits = 0;
+        __syncthreads();
+        for (int k = threadIdx.x; k < answers; k += BLOCK) {
+            atomicMax(&longest, info[2 * k]);
+            atomicOr(&bits, info[2 * k + 1]);
+        }
+        __syncthreads();
+        if (threadIdx.x > 0)
+            return;
+        if constexpr (PERIODIC) {
+            bits = (bits & ~BIT_NOT_FINITE) | (met & NOT_FINITE ? BIT_NOT_FINITE : 0) | (met & TOO_FAR ? BIT_OUT_OF_RANGE : 0);
+            bits |= cutoffs[row_of(met) * (LATTICE_END + 1) + LATTICE_END] != 0 ? 0 : BIT_BOX_TOO_SMALL;
+        }
+        *status |= bits;
+        *required = longest > *required ? longest : *required;
+        *rebuild_count += 1;
+    }
+
+private:
+    // The row of `cutoffs` that holds for all turns that were met: of 0, and of powers of two less one.
+    JFRNN_FUNCTION int row_of(int met) { return 32 - __clz(met & (NOT_FINITE - 1)); }
+    JFRNN_FUNCTION bool is_finite(const real* p) {
+        real sum = 0;
+        for (int k = 0; k < DIM; ++k)
+            sum += p[k] - p[k];
+        return sum == 0;
+    }
+    // A point, near the box: one that is far away is moved by multiples of 256 vectors, exactly (jfrnn/_geometry/far.py).
+    JFRNN_MEMBER void take(long long i, real* p) const {
+        constexpr real MOST_STEPS = DOUBLE ? 1 << 22 : 1 << 11;
+        for (int k = 0; k < DIM; ++k) {
+            p[k] = now[DIM * i + k];
+            if (!PERIODIC || !lattice.periodic(k))
+                continue;
+            const real units = p[k] * lattice.transform(k, k), steps = rint(units / STEP);
+            if (fabs(units) < FAR || !(fabs(steps) <= MOST_STEPS) || steps == 0)
+                continue;
+            const real length = lattice.vector(k, k), high = half_of(length), low = length - high, turns = steps * STEP;
+            p[k] = Lattice::add(Lattice::add(p[k], -Lattice::mul(turns, high)), -Lattice::mul(turns, low));
+        }
+    }
+    // A float rounded to half its mantissa.
+    JFRNN_FUNCTION real half_of(real x) {
+        constexpr int DROPPED = DOUBLE ? 27 : 12;
+        if constexpr (DOUBLE)
+            return __longlong_as_double((__double_as_longlong(x) + (1ll << (DROPPED - 1))) >> DROPPED << DROPPED);
+        else
+            return __uint_as_float((__float_as_uint(x) + (1u << (DROPPED - 1))) >> DROPPED << DROPPED);
+    }
+    JFRNN_MEMBER real turns_of(const real* p, int k) const {
+        return floor(Lattice::mul(Lattice::add(p[k], -lattice.origin(k)), lattice.transform(k, k)));
+    }
+    // Lattice vectors do not count as motion. Where rounding leaves open how many lie between, a point has moved.
+    JFRNN_MEMBER bool has_moved(long long i) const {
+        real point[3], difference[3], turns[3] = {0, 0, 0}, most = 0, square = 0;
+        const real* before = reference + DIM * i;
+        take(i, point);
+        if (!is_finite(point) && !is_finite(before))
+            return false;
+        bool sure = true, turned = false;
+        for (int k = 0; k < DIM; ++k) {
+            difference[k] = point[k] - before[k];
+            if (PERIODIC && lattice.periodic(k)) {
+                const real units = difference[k] * lattice.transform(k, k);
+                turns[k] = rint(units);
+                turned |= turns[k] != 0;
+                most = fabs(units) > most ? fabs(units) : most;
+                sure &= fabs(units - turns[k]) + 16 * EPS * (most + 2) < real(0.5);
+            }
+        }
+        for (int k = 0; k < DIM; ++k) {
+            real left = fabs(difference[k]);
+            if (PERIODIC && turned) {
+                sure &= !lattice.periodic(k) || fabs(turns_of(point, k)) <= LARGEST_TURN;
+                const real taken = turns[k] * lattice.vector(k, k);
+                left = fabs(difference[k] - taken) + 4 * EPS * (left + fabs(taken));
+            }
+            square += left * left;
+        }
+        return !(sure && square < limit[0]);
+    }
+    // Writes a point and its packed turns (jfrnn/_geometry/wrapping.py), and returns what was met.
+    JFRNN_MEMBER int write_row(long long i, const real* p) const {
+        int packed = 0, met = 0;
+        bool near = true;
+        for (int k = 0; k < DIM; ++k) {
+            const real turns = lattice.periodic(k) ? turns_of(p, k) : real(0);
+            near &= fabs(turns) <= LARGEST_TURN;
+            const int whole_turns = near ? (int)turns : 0;
+            packed |= (whole_turns + 512) << (10 * k);
+            met |= whole_turns < 0 ? -whole_turns : whole_turns;
+        }
+        if (!is_finite(p)) {
+            packed = -1;
+            met = NOT_FINITE;
+        } else if (!near) {
+            packed = -2;
+            met = TOO_FAR;
+        }
+        real* row = positions + ROW * i;
+        for (int k = 0; k < DIM; ++k)
+            row[k] = p[k];
+        if constexpr (DOUBLE)
+            row[DIM] = packed;
+        else
+            row[DIM] = __int_as_float(packed);
+        return met;
+    }
+};

@@ -1,0 +1,42 @@
+"""Lists with a skin on CUDA that are renewed where they are stale, without the host: what stands around the kernels of a search."""
+
+import functools
+from typing import NamedTuple
+
+from jfrnn.kernels._native import program
+from jfrnn.kernels._program import Entry, Kernel, declare
+from jfrnn.kernels.cells_cuda import place_words
+
+BLOCK = 256
+_MOST_BLOCKS = 1024
+MOST_TURNS = (0, *((1 << k) - 1 for k in range(1, 10)))  # for which a search is told how far rounding goes, one of them
+
+
+class RenewKernels(NamedTuple):
+    """What says whether a list is stale; what comes before a search, and behind it."""
+
+    check: Kernel
+    prepare: Kernel
+    settle: Kernel
+    keep: Kernel
+
+
+def blocks(n: int) -> int:
+    """Return how many blocks look at n points."""
+    return min(-(-n // BLOCK), _MOST_BLOCKS)
+
+
+@functools.lru_cache(64)
+def renew_kernels(dim: int, double: bool, periodic: bool, ordered: bool, bits: tuple[int, int, int]) -> RenewKernels:
+    """Return the kernels for a dimension, a dtype and a space.
+
+    `bits` are those of a status for particles that are not finite, for those too far away, and for a box that is too small.
+    """
+    first, words, word = place_words(2 if double else 1)
+    names = ("BIT_NOT_FINITE", "BIT_OUT_OF_RANGE", "BIT_BOX_TOO_SMALL")
+    constants = {"ORDERED": ordered, "FIRST_PLACE": first, "PLACE_WORDS": words, "PLACE_WORD": word, "BLOCK": BLOCK}
+    constants |= dict(zip(names, bits, strict=True))
+    text = program(double, dim, "renew.cuh", PERIODIC=periodic, **constants)
+    variant = f"{dim}d_{'f64' if double else 'f32'}{'_nearest' * periodic}{'_ordered' * ordered}"
+    entries = [Entry(f"Renew.{method}", BLOCK, 4) for method in RenewKernels._fields]
+    return RenewKernels(*declare(f"renew_cuda_{variant}", text, *entries, cuda=True))
