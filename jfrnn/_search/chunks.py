@@ -63,7 +63,7 @@ def run_chunk(
     ...     return jax.lax.fori_loop(0, 5, step, (x, nbrs))
     >>> x = jax.random.uniform(jax.random.key(0), (200, 3))
     >>> nbrs = jfrnn.search(x, 0.2, skin=0.05)
-    >>> x, nbrs = run_chunk(chunk, x, nbrs, lambda x: x)
+    >>> x, nbrs = jfrnn.run_chunk(chunk, x, nbrs, lambda x: x)
     >>> bool(nbrs.overflow)
     False
     """
