@@ -112,7 +112,7 @@ def primitive_neighbor_list(
         As `neighbor_list`.
 
     Raises:
-        As `neighbor_list`.
+        TypeError, ValueError: as `neighbor_list`.
     """
     wrong = not isinstance(quantities, str) or not quantities or set(quantities) - set("ijdDS")
     if wrong:
