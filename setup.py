@@ -1,4 +1,4 @@
-"""What a package page needs beyond pyproject.toml: addresses, and a README whose links work there.
+"""What packages need beyond pyproject.toml: a page whose addresses and links work, and the links between folders in an sdist.
 
 `[tool.jfrnn] repository` in pyproject.toml is the one place that says where the project lives, as https://github.com/owner/jfrnn:
 files are then looked for below `blob/main`, pictures below `raw/main`. While it is empty, links to files become their text and the
@@ -10,6 +10,7 @@ import tomllib
 from pathlib import Path
 
 from setuptools import setup
+from setuptools.command.sdist import sdist
 
 ROOT = Path(__file__).parent
 CHECKOUT = re.compile(r"<!-- checkout -->.*?<!-- end checkout -->\n*", re.DOTALL)  # of no use to whoever has a wheel
@@ -43,8 +44,19 @@ def list_addresses(repository: str) -> dict[str, str]:
     return {"Homepage": repository} | {name: f"{repository}/blob/main/{path}" for name, path in pages.items()}
 
 
+class SdistWithLinks(sdist):
+    """A source distribution that holds jfrnn/cases and jfrnn/kernels as links, as a checkout does: its tests run from it."""
+
+    def make_release_tree(self, base_dir: str, files: list[str]) -> None:
+        """Copy the files, then add the links, which setuptools leaves out."""
+        super().make_release_tree(base_dir, files)
+        for name in ("cases", "kernels"):
+            Path(base_dir, "jfrnn", name).symlink_to(Path("..", name))
+
+
 home = read_repository()
 setup(
+    cmdclass={"sdist": SdistWithLinks},
     long_description=rewrite_links((ROOT / "README.md").read_text(encoding="utf-8"), home),
     long_description_content_type="text/markdown",
     project_urls=list_addresses(home),

@@ -40,6 +40,7 @@ html_css_files = ["pages.css"]
 
 HERE = Path(__file__).parent
 STUDIES = HERE.parent / "notebooks"
+_GUIDE = re.compile(r'"([^"]+)"\s+\(docs/(guides/[\w-]+)\.md\)')
 
 
 def setup(app):
@@ -57,7 +58,10 @@ def setup(app):
 
 
 def _escape(app, what, name, obj, options, lines):
-    """Escape what stands for itself: |x| is a distance and *rows are arguments."""
+    """Link guides, and escape what stands for itself: |x| is a distance and *rows are arguments."""
+    lines[:] = _GUIDE.sub(r":doc:`\1 </\2>`", "\n".join(lines)).split("\n")
     for k, line in enumerate(lines):
+        if k and lines[k - 1].strip() == "Returns:":  # what stands before a colon is no type
+            line = re.sub(r"(?=\S)", ": ", line, count=1)
         if not line.lstrip().startswith((">>>", "...")):
             lines[k] = re.sub(r"(?<=[\[(])\*(?=\w)|(?<=, )\*(?=\w)", r"\\*", line.replace("|", "\\|"))

@@ -138,7 +138,8 @@ def against_error(rows: Sequence[SearchRow], quantity: Quantity) -> Figure:
     lists = {row.method: row for row in scene if row.method not in _look.WITHOUT_LIST} or {row.method: row for row in scene}
     drawn = [lists[name] for name in _look.choose(row.method for row in scene) if name in lists]
     exact, wrong = [row for row in drawn if not row.errors], [row for row in drawn if row.errors]
-    title = f"{len(exact)} of {len(drawn)} lists are exact" if len(drawn) > 1 else f"{quantity.label.split(' [')[0]}".capitalize()
+    title = f"{len(exact)} of the {len(drawn)} lists drawn {'is' if len(exact) == 1 else 'are'} exact"
+    title = title if len(drawn) > 1 else quantity.label.split(" [")[0].capitalize()
     if exact and wrong and not (quantity is TIME and _beside(scene)):
         best, other = (min(of, key=lambda row: quantity.value(row) or 0) for of in (exact, wrong))
         ratio = _look.factor((quantity.value(other) or 0) / (quantity.value(best) or 1))
@@ -169,7 +170,7 @@ def of_all(rows: Sequence[SearchRow], quantity: Quantity) -> Figure:
     down = math.ceil(len(methods) / across)
     figure = Figure(figsize=(_look.WIDTH, 1.6 + 1.3 * down), layout="constrained")
     panels = figure.subplots(down, across, sharex=True, sharey=True, squeeze=False).ravel()
-    theirs = _theirs(rows, quantity)
+    theirs = {name: line for name, line in _theirs(rows, quantity).items() if len(line) > 1}
     faint = [sorted(line.items()) for line in lines.values()]
     for axes, method in zip(panels, methods, strict=False):
         _look.clear(axes)

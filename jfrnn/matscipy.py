@@ -46,7 +46,7 @@ def neighbour_list(
         As `jfrnn.ase.neighbor_list`; indices and shifts are int32, as in matscipy.
 
     Raises:
-        As `jfrnn.ase.neighbor_list`.
+        TypeError, ValueError: as `jfrnn.ase.neighbor_list`.
     """
     if positions is not None and numbers is None:
         numbers = np.ones(len(positions), np.int32)

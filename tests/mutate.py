@@ -23,11 +23,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 import jax
+from places import ROOT, list_files
 from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-ROOT = Path(__file__).resolve().parent.parent
 ROOMS = {path.stem: path for path in sorted((ROOT / "tests" / "mutants").glob("*.toml"))}
 ROWS = ROOT / "out" / "mutants.jsonl"
 LONGEST = 600  # that the tests of a fault may take [s]; one that never ends is noticed, too
@@ -73,15 +73,11 @@ def read_mutants(rooms: list[str]) -> list[Mutant]:
 
 
 def copy_tree(to: Path) -> None:
-    """Copy what git knows of, and what it does not ignore."""
-    listed = subprocess.run(
-        ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"], cwd=ROOT, check=True, capture_output=True
-    )
-    for name in filter(None, listed.stdout.decode().split("\0")):
-        source = ROOT / name
-        if source.exists() and not name.startswith(("experiments/results/", "notebooks/", "docs/_static/")):
+    """Copy the project, without what no test of a fault reads."""
+    for name in list_files():
+        if not name.startswith(("experiments/results/", "notebooks/", "docs/_static/")):
             (to / name).parent.mkdir(parents=True, exist_ok=True)
-            shutil.copy2(source, to / name, follow_symlinks=False)
+            shutil.copy2(ROOT / name, to / name, follow_symlinks=False)
 
 
 def run_tests(tests: tuple[str, ...], tree: Path, marked: str) -> tuple[int, str]:

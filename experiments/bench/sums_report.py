@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from experiments._commands import RetryFailed, RowsFolder, take_folder
 from experiments._config import load
-from experiments._look import MARKERS, OURS, PEER, WIDTH, dress, factor, head, plain, write_names
+from experiments._look import MARKERS, OURS, PEERS_COLORS, WIDTH, dress, factor, head, plain, write_names
 from experiments.bench.sums import ERROR_UNIT, Config, SumRow, run
 from experiments.bench.ways import WAYS
 
@@ -23,7 +23,8 @@ PANELS = {
 }
 SHARED = (1, 2, 5, 10, 20, 50, 100, 200)  # sums per rebuild of a list
 _OTHERS = ("jax-md", "nvalchemi", "scipy")
-_STYLES = {way: (PEER if way.startswith(_OTHERS) else OURS, marker) for way, marker in zip(WAYS, MARKERS, strict=True)}
+_COLORS = dict(zip((way for way in WAYS if way.startswith(_OTHERS)), PEERS_COLORS, strict=False))
+_STYLES = {way: (_COLORS.get(way, OURS), marker) for way, marker in zip(WAYS, MARKERS, strict=True)}
 _Line = dict[str, Any]
 
 
@@ -111,7 +112,8 @@ def draw(lines: list[_Line]) -> Figure:
             if axes in panels[:, -1]:
                 write_names(axes, ends)
             for way, x, y, color in (end for end in ends if end[0] not in last_ways):
-                axes.annotate(way, (x, y), (-4, 6), textcoords="offset points", ha="right", fontsize=8, color=color)
+                text = axes.annotate(way, (x, y), (-14, 8), textcoords="offset points", ha="right", fontsize=8, color=color)
+                text.set_bbox({"facecolor": "white", "edgecolor": "none", "pad": 0.5})  # lines go on behind it
         column[0].set_title(f"{layout}: {what}", loc="left", fontsize=10)
     head(figure, _headline(lines))
     return figure

@@ -69,10 +69,9 @@ def search_scenes() -> str:
 
 
 def latency() -> str:
-    """Return microseconds of calls and of steps for few particles."""
-    ours = {"list": "list", "counts": "counts", "density": "density", "density, gradient": "and its gradient"}
+    """Return microseconds of calls and, behind a stroke, of steps for few particles."""
+    ours = {"list": "list", "counts": "counts", "density": "density", "density, gradient": "its gradient"}
     heads = ["", ">n", ">`x + 1`", *(f">{title}" for title in ours.values()), ">jax-md list", ">nvalchemi list"]
-    heads += [f">step: {title}" for title in ours.values()]
     lines = []
     for rows in (read("latency/cpu.csv"), read("latency/gpu.csv")):
         for n in (64, 256, 1000, 4096, 32768):
@@ -82,14 +81,14 @@ def latency() -> str:
             floor, mine = one(of_n, what="x + 1"), [one(of_n, who="jfrnn", what=what) for what in ours]
             peers = [[row for row in of_n if row["who"].startswith(who)] for who in ("jax-md", "nvalchemi")]
             fastest = [min((float(row["waited_us"]) for row in peer), default=None) for peer in peers]
-            line = [machine(rows), whole(n), _us(floor), *(_us(row) for row in mine)]
-            line += ["" if us is None else f"{us:.0f}" for us in fastest]
-            lines.append([*line, *("" if row is None else f"{float(row['step_us']):.0f}" for row in mine)])
+            line = [machine(rows), whole(n), _us(floor, "waited_us")]
+            line += [f"{_us(row, 'waited_us')} / {_us(row, 'step_us')}" if row else "" for row in mine]
+            lines.append([*line, *("" if us is None else whole(round(us)) for us in fastest)])
     return markdown(heads, lines)
 
 
-def _us(row: Row | None) -> str:
-    return "" if row is None else f"{float(row['waited_us']):.0f}"
+def _us(row: Row | None, column: str) -> str:
+    return "" if row is None else whole(round(float(row[column])))
 
 
 def sums() -> str:
@@ -133,7 +132,7 @@ def empty_space() -> str:
     for method in dict.fromkeys(row["method"] for row in rows):
         cells = [one(rows, method=method, growth=growth) for growth in growths]
         lines.append([name_of(method), *(number(row["median_s"], 1e3) if row else "" for row in cells)])
-    return markdown(("method", *(f">{float(growth):g} {TIMES}" for growth in growths)), lines)
+    return markdown(("method", *(f">{whole(growth)} {TIMES}" for growth in growths)), lines)
 
 
 def triangles() -> str:

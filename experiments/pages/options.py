@@ -7,8 +7,9 @@ from typing import NamedTuple
 from experiments.pages.rows import Row, machine, markdown, number, one, read, whole
 
 FIRST = "the first row"
+AS_MANY = "one cutoff, as many pairs"
 _WHATS = {"list": "list", "count": "counts", "sum": "sum"}
-_PEERS = {"scipy": "SciPy", "hashgrid": "`wp.HashGrid`"}
+_PEERS = {"scipy": "SciPy", "hashgrid": "HashGrid"}
 _COSTS = {  # names of values in pages, and the options whose lists they tell of
     "box": "box, periodic",
     "skewed": "box, skewed",
@@ -42,27 +43,26 @@ def options() -> str:
     where = machines()
     lines = [row for row in where[0].rows if not _about_cutoffs(row)]
     columns = [(each, f"{what}_ratio", title) for each in where for what, title in _WHATS.items()]
-    return _table(lines, columns, lambda row: [row["option"]], ("option",))
+    return _table(lines, columns, lambda row: row["option"])
 
 
 def cutoffs() -> str:
-    """Return what cutoffs of many kinds cost, as a multiple of what stands beside them, and how far peers are behind counts."""
+    """Return what cutoffs of many kinds cost, as a multiple of one or of what they name, and how far peers are behind counts."""
     where = machines()
     columns = []
     for each in where:
         columns += [(each, f"{what}_ratio", title) for what, title in _WHATS.items()]
         columns += [(each, f"{peer}_behind", title) for peer, title in _PEERS.items()]
     lines = [row for row in where[0].rows if _about_cutoffs(row)]
-    return _table(lines, columns, lambda row: [row["option"], row["beside"]], ("option", "over"))
+    said = {AS_MANY: "", FIRST: ", against the plain search above"}
+    return _table(lines, columns, lambda row: row["option"] + said.get(row["beside"], f", against {row['beside']}"))
 
 
 def _about_cutoffs(row: Row) -> bool:
     return bool(row["spread"]) or row["beside"] != FIRST
 
 
-def _table(
-    rows: list[Row], columns: list[tuple[Machine, str, str]], names: Callable[[Row], list[str]], heads: tuple[str, ...]
-) -> str:
+def _table(rows: list[Row], columns: list[tuple[Machine, str, str]], name: Callable[[Row], str]) -> str:
     """Return a table of columns, each of one machine, the first of which names it; less empty columns and rows."""
     found = [[_cell(each.row(row["option"], row["beside"]), column) for row in rows] for each, column, _ in columns]
     there = [k for k in range(len(rows)) if any(cells[k] for cells in found)]
@@ -71,14 +71,14 @@ def _table(
     for each, _, title in (columns[place] for place in kept):
         titles.append(f">{title}" + f", {each.name}" * (each.name not in named))
         named.add(each.name)
-    lines = [[*names(rows[k]), *(found[place][k] for place in kept)] for k in there]
-    return markdown((*heads, *titles), lines)
+    lines = [[name(rows[k]), *(found[place][k] for place in kept)] for k in there]
+    return markdown(("option", *titles), lines)
 
 
 def _cell(row: Row, column: str) -> str:
-    """Return a ratio; of a peer whose counts differ, how many pairs it has too few or too many, too."""
+    """Return a ratio; of a peer whose counts differ, by how many pairs they are off, too."""
     differs = row.get(column.replace("behind", "differs")) if column.endswith("behind") else None
-    said = f" ({whole(differs)} {'pair differs' if differs == '1' else 'pairs differ'})" if differs not in (None, "", "0") else ""
+    said = f" ({whole(differs)} off)" if differs not in (None, "", "0") else ""
     return "" if not row.get(column) else f"{_times(row[column])}{said}"
 
 

@@ -112,7 +112,7 @@ def primitive_neighbor_list(
         As `neighbor_list`.
 
     Raises:
-        As `neighbor_list`.
+        TypeError, ValueError: as `neighbor_list`.
     """
     wrong = not isinstance(quantities, str) or not quantities or set(quantities) - set("ijdDS")
     if wrong:
@@ -189,8 +189,8 @@ def _cutoffs(cutoff: Given, n: int, numbers: Given) -> tuple[np.ndarray, str, np
         raise ValueError(
             f"cutoff must be a number, a dictionary, or radii of shape [{n}], one per atom, got shape {list(values.shape)}."
         )
-    if not ((values >= 0) & (values < math.inf)).all():
-        raise ValueError(f"cutoff must be finite and at least 0, got {cutoff!r}.")
+    if len(bad := np.flatnonzero(~((values >= 0) & (values < math.inf)))):
+        raise ValueError(f"cutoff must be finite and at least 0, got {values[bad[0]]:g} for atom {bad[0]}.")
     return values, "radii", None
 
 

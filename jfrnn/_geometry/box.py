@@ -35,6 +35,11 @@ class Box:
         per_system: Whether each system of a batch has a box of its own. Static.
         fractional: Whether positions count the lattice vectors. Static.
         images_of_list: Of the box of a list (`nbrs.box`): the images of the list, which count where the vectors are traced. Static.
+
+    >>> import jax.numpy as jnp, jfrnn
+    >>> nbrs = jfrnn.search(jnp.array([[0.1, 0.5], [0.9, 0.5]]), 0.3, box=jfrnn.Box([1.0, 1.0]))
+    >>> nbrs.count.tolist()
+    [1, 1]
     """
 
     vectors: Numbers

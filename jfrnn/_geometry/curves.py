@@ -39,6 +39,10 @@ def morton_encode(coords: Array, bits: int | None = None) -> Array:
             concrete; of traced ones only the lowest `bits` bits are used.
 
     Differentiable: no (integers). Jit: yes, bits static. vmap: yes. Source: Morton (1966), A computer oriented geodetic data base.
+
+    >>> import jax.numpy as jnp, jfrnn
+    >>> jfrnn.morton_encode(jnp.array([[0, 0], [1, 0], [0, 1], [1, 1]]), bits=1).tolist()
+    [0, 1, 2, 3]
     """
     coords, bits = _check_coords(coords, bits, default=True)
     return _encode(coords, bits, morton_words)
@@ -59,6 +63,10 @@ def morton_decode(keys: Array, dim: int, bits: int | None = None) -> Array:
         TypeError, ValueError: an argument is of the wrong kind, shape or range, as in `morton_encode`.
 
     Differentiable: no (integers). Jit: yes, dim and bits static. vmap: yes. Source: as in `morton_encode`.
+
+    >>> import jax.numpy as jnp, jfrnn
+    >>> jfrnn.morton_decode(jnp.array([0, 1, 2, 3], jnp.uint32), dim=2, bits=1).tolist()
+    [[0, 0], [1, 0], [0, 1], [1, 1]]
     """
     keys, dim, bits = _check_keys(keys, dim, bits, default=True)
     return _decode(keys, dim, bits, _morton_axes)
@@ -84,6 +92,10 @@ def hilbert_encode(coords: Array, bits: int) -> Array:
 
     Differentiable: no (integers). Jit: yes, bits static. vmap: yes. Source: Skilling (2004), Programming the Hilbert curve,
     doi:10.1063/1.1751381.
+
+    >>> import jax.numpy as jnp, jfrnn
+    >>> jfrnn.hilbert_encode(jnp.array([[0, 0], [0, 1], [1, 1], [1, 0]]), bits=1).tolist()
+    [0, 1, 2, 3]
     """
     coords, bits = _check_coords(coords, bits)
     return _encode(coords, bits, hilbert_words)
@@ -104,6 +116,10 @@ def hilbert_decode(keys: Array, dim: int, bits: int) -> Array:
         TypeError, ValueError: an argument is of the wrong kind, shape or range, as in `morton_encode`.
 
     Differentiable: no (integers). Jit: yes, dim and bits static. vmap: yes. Source: as in `hilbert_encode`.
+
+    >>> import jax.numpy as jnp, jfrnn
+    >>> jfrnn.hilbert_decode(jnp.array([0, 1, 2, 3], jnp.uint32), dim=2, bits=1).tolist()
+    [[0, 0], [0, 1], [1, 1], [1, 0]]
     """
     keys, dim, bits = _check_keys(keys, dim, bits)
     return _decode(keys, dim, bits, _hilbert_axes)

@@ -41,6 +41,10 @@ def sort_order(positions: Points, cell_size: Number, *, curve: Literal["hilbert"
         TypeError, ValueError: an argument is of the wrong kind, shape or range.
 
     Differentiable: no (integers). Jit: yes, cell_size and curve static. vmap: yes. Source: see the encoders.
+
+    >>> import jax.numpy as jnp, jfrnn
+    >>> jfrnn.sort_order(jnp.array([[0.9, 0.0], [0.1, 0.0], [0.5, 0.0]]), 0.1).tolist()
+    [1, 2, 0]
     """
     positions = check_positions("positions", positions)
     size = _check_cell_size(cell_size, np.dtype(positions.dtype))

@@ -10,7 +10,7 @@ from jax.core import Tracer
 
 from jfrnn._geometry import Box
 from jfrnn._search.kept_search import Kept, KeptSearch
-from jfrnn._tracing import Real, own_transfers
+from jfrnn._tracing import Flags, Numbers, Points, Real, own_transfers
 
 State = TypeVar("State")
 
@@ -19,12 +19,12 @@ def run_chunk(
     chunk: Callable[[State, Kept], tuple[State, Kept]],
     state: State,
     nbrs: Kept,
-    positions: Callable[[State], Array],
+    positions: Callable[[State], Points],
     *,
-    queries: Callable[[State], Array] | None = None,
-    active: Callable[[State], Array] | None = None,
+    queries: Callable[[State], Points] | None = None,
+    active: Callable[[State], Flags] | None = None,
     box: Callable[[State], Box] | None = None,
-    cutoff: Callable[[State], Array] | None = None,
+    cutoff: Callable[[State], Numbers | Points | tuple[Numbers, Numbers]] | None = None,
     slack: Real = 1.25,
 ) -> tuple[State, Kept]:
     """Run a jitted chunk of steps; if its list overflowed, grow the list and replay the chunk from the same state.
@@ -63,7 +63,7 @@ def run_chunk(
     ...     return jax.lax.fori_loop(0, 5, step, (x, nbrs))
     >>> x = jax.random.uniform(jax.random.key(0), (200, 3))
     >>> nbrs = jfrnn.search(x, 0.2, skin=0.05)
-    >>> x, nbrs = run_chunk(chunk, x, nbrs, lambda x: x)
+    >>> x, nbrs = jfrnn.run_chunk(chunk, x, nbrs, lambda x: x)
     >>> bool(nbrs.overflow)
     False
     """

@@ -78,15 +78,18 @@ def search(
         backend: "warp" (compiled kernels), "jax" (any device), "hashgrid" (`wp.HashGrid`), "brute", or "auto", the fastest there.
 
     Returns:
-        A `NeighborList`; `idx` has shape [m, capacity], unused slots hold n. The same input gives the same bits.
+        A `NeighborList`; `idx` has shape [m, capacity], unused slots hold n. `status` tells of overflow and coordinates not finite.
 
     Raises:
         TypeError, ValueError: an argument is of the wrong kind, shape or range, or `capacity` is missing under jit.
         ImportError, RuntimeError: the engine's package is not there, or it cannot run on the platform.
-        Overflow and non-finite coordinates are known only from data: see `status`, `overflow` and `check`.
 
-    Jit and vmap: yes, with capacity. Differentiable: see `NeighborList.vectors`. Source: cell lists (Hockney & Eastwood 1981, ch.
-    8); strict cutoff (Peifle 2019, §2.2).
+    Jit and vmap: yes, with capacity. Gradients: `NeighborList.vectors`. Source: Hockney & Eastwood 1981, ch. 8; Peifle 2019, §2.2.
+
+    >>> import jax.numpy as jnp, jfrnn
+    >>> nbrs = jfrnn.search(jnp.array([[0.0, 0.0], [0.3, 0.4], [2.0, 0.0]]), 1.0)
+    >>> nbrs.count.tolist(), [indices.tolist() for indices in nbrs.pairs()]
+    ([1, 1, 0], [[0, 1], [1, 0]])
     """
     problem, inputs = check_problem(
         positions, cutoff, queries, box, batch, radius_rule, species, exclude, half, include_self, closed, backend, skin, active
@@ -149,11 +152,10 @@ def search_edges(
         backend: As in `search`.
 
     Returns:
-        An `EdgeList`.
+        An `EdgeList`; `status` tells of overflow and of coordinates that are not finite.
 
     Raises:
         TypeError, ValueError, ImportError, RuntimeError: as in `search`; ValueError: there are more than 2³¹ - 1 pairs.
-        Overflow of a given total and non-finite coordinates are known only from data: see `status`, `overflow` and `check`.
 
     Jit and vmap: yes, with total. Differentiable: see `EdgeList.edges`. Memory: the guide "Memory" (docs/guides/memory.md).
 
@@ -208,6 +210,10 @@ def count(
             would report.
 
     Memory: as in `search`, without the list. Differentiable: no (integers). Jit: yes. vmap: yes.
+
+    >>> import jax.numpy as jnp, jfrnn
+    >>> jfrnn.count(jnp.array([[0.0, 0.0], [0.3, 0.4], [2.0, 0.0]]), 1.0).tolist()
+    [1, 1, 0]
     """
     problem, inputs = check_problem(
         positions, cutoff, queries, box, batch, radius_rule, species, exclude, half, include_self, closed, backend, 0.0, active

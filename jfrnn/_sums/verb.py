@@ -32,7 +32,7 @@ REDUCTIONS = ("sum", "max", "min")
 SYMMETRIES = (None, "symmetric", "antisymmetric")
 
 
-def pair_sum(
+def pair_sum(  # noqa: D417 (nine arguments share a line)
     fn: Callable[[Array, Any, Any], Sums],
     positions: Points,
     cutoff: AnyCutoff | None,
@@ -70,15 +70,7 @@ def pair_sum(
         reduce: "sum"; or "max" or "min" of floats, of which rows without neighbors are -inf or inf.
         symmetry: "symmetric" or "antisymmetric": fn is evaluated in one direction of each pair, and the other gets the same value,
             or its negative, bit for bit. Not with queries, nor with the rules "gather" and "scatter".
-        queries: As in `search`.
-        box: As in `search`.
-        batch: As in `search`.
-        radius_rule: As in `search`.
-        species: As in `search`.
-        exclude: As in `search`.
-        include_self: As in `search`.
-        closed: As in `search`.
-        active: As in `search`.
+        queries, box, batch, radius_rule, species, exclude, include_self, closed, active: As in `search`.
         compensated: Carry the rounding errors of the sums along (two-sum, Knuth 1969), also in derivatives.
         backend: "warp" (fn becomes part of the kernel that finds the pairs), "jax" (any device), "brute", or "auto".
         neighbors: A padded or flat list to use instead of a search: its pairs that are closer than the cutoff at these positions.
@@ -94,6 +86,11 @@ def pair_sum(
 
     Jit: yes; outside of it, define fn once. vmap: yes, one after the other. Source: sums as in SPH (Gingold & Monaghan 1977,
     doi:10.1093/mnras/181.3.375); derivatives by transposition (Radul et al. 2023, doi:10.1145/3571236).
+
+    >>> import jax.numpy as jnp, jfrnn
+    >>> x = jnp.array([[0.0, 0.0], [0.3, 0.4], [2.0, 0.0]])
+    >>> jfrnn.pair_sum(lambda r, i, j: j * (r @ r), x, 1.0, jnp.array([1.0, 2.0, 4.0])).tolist()
+    [0.5, 0.25, 0.0]
     """
     from jfrnn._sums.reduction import pairs_of_list, pairs_of_search, reduce_pairs
 

@@ -47,13 +47,11 @@ def search_triangles(
 
     Returns:
         A `TriangleList`; `idx` has shape [n, capacity], unused slots hold f. The order within rows is unspecified, but the same
-        input gives the same bits.
+        input gives the same bits. `status` tells of overflow, of coordinates that are not finite and of invalid vertex indices.
 
     Raises:
         TypeError, ValueError: an argument is of the wrong kind, shape or range, or `capacity` is missing under jit.
         ImportError, RuntimeError: "warp" or "bvh", and Warp is not installed or cannot run on the platform.
-        Overflow of a given capacity, coordinates that are not finite and invalid vertex indices are known only from data: see
-            `status`, `overflow` and `check`.
 
     Jit and vmap: yes, with capacity. `jax.shard_map`: yes, with distributed particles and the wall on every device. Differentiable:
     see `TriangleList.closest`. Memory and what compiles: the guide "Walls of triangles" (docs/guides/triangles.md).

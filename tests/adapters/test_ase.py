@@ -165,6 +165,7 @@ BAD = {
     "pbc must be one bool or three": {"pbc": (True, False)},
     r"cutoff must be a number, a dictionary, or radii of shape \[2\]": {"cutoff": np.ones(3)},
     "cutoff must be finite and at least 0": {"cutoff": -1.0},
+    "cutoff must be finite and at least 0, got -1 for atom 1": {"cutoff": [1.0, -1.0]},
     "cutoff must be finite and at least 0, got inf for": {"cutoff": {(1, 1): np.inf}, "numbers": [1, 1]},
     r"cutoff must be a number \[length\], a dictionary of numbers, or radii of all atoms, got str": {"cutoff": "3"},
     r"cutoff must be a number \[length\] for \(1, 1\), got str": {"cutoff": {(1, 1): "2"}, "numbers": [1, 1]},

@@ -1,6 +1,5 @@
 """Skin, update, growth and inactive particles: after any motion the masked list holds exactly the oracle's pairs."""
 
-import doctest
 from fractions import Fraction
 from itertools import product
 
@@ -14,7 +13,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import jfrnn
-from jfrnn._search import chunks as _chunks
 from jfrnn._search.verlet import list_radius
 
 CUTOFF, SKIN = 0.3, 0.1
@@ -225,7 +223,6 @@ def test_a_chunk_is_replayed_until_its_list_was_large_enough():
     np.testing.assert_array_equal(once, end)
     with pytest.raises(TypeError, match="jit the chunk, not the loop"):
         jax.jit(lambda x: jfrnn.run_chunk(squeeze, x, nbrs, lambda x: x)[0])(x)
-    assert doctest.testmod(_chunks).failed == 0
 
 
 @pytest.mark.parametrize(

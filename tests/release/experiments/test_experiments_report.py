@@ -233,7 +233,7 @@ def test_titles_say_what_the_rows_say(many):
     lean = "jfrnn's list takes 0.2 times the memory of the leanest other, cell lists (thesis) (means of layouts)"
     assert said["memory_by_fill"] == lean
     assert said["speed_against_error"].startswith(
-        "5 of 7 lists are exact; the fastest of the others, cell lists (thesis), takes 5 times"
+        "5 of the 7 lists drawn are exact; the fastest of the others, cell lists (thesis), takes 5 times"
     )
     assert said["speed_against_sum_error"].startswith("Wrong pairs change a sum that jumps at the cutoff by up to 1 %")
     slow = [replace(row, median_s=0.05) if row.method == "vesin" and row.layout == "full" else row for row in many]

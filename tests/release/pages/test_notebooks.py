@@ -58,7 +58,7 @@ SAYS = {  # pictures, and what each prints
     ),
     "open_questions": (
         2,
-        ("times as long as cll", "turned2 tumbled / straight", "no rows of warp-update and warp-rebuild", "growth: time"),
+        ("times as long as cll:", "turned2 tumbled / straight", "no rows of warp-update and warp-rebuild", "growth: time"),
     ),
     "speed_against_error": (4, ("exact on every scene", "methods with a list give")),
     "thesis_reproduced": (7, ("have a counterpart here", "verdict of the thesis, CLL before")),
@@ -96,7 +96,7 @@ def test_notebook(name):
     assert failed == ""
     pictures, said = SAYS[name]
     if name == "open_questions":
-        two = ("no rows of {} and {}", "step: {} / {}")[not methods.lacks("nanoflann-dynamic")]
+        two = ("no rows of {} and {}", "{} / {}, by")[not methods.lacks("nanoflann-dynamic")]
         said += (two.format("nanoflann-dynamic", "nanoflann-rebuild"),)
     assert drawn == pictures
     assert [words for words in said if words not in printed] == []
@@ -108,3 +108,11 @@ def test_notebooks_take_no_private_names():
         code = "\n".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == "code")
         private = r"\b(?:jfrnn|experiments)\.[\w.]*\b_\w+|import .*\b_\w+|\w\._(?!replace\b)[a-z]\w*"
         assert re.findall(private, code) == [], path.name
+
+
+def test_printed_lines_fit_a_page():
+    """A page of 1280 pixels shows 106 letters beside each other."""
+    for path in NOTEBOOKS.glob("*.ipynb"):
+        outputs = [out for cell in json.loads(path.read_text(encoding="utf-8"))["cells"] for out in cell.get("outputs", ())]
+        printed = "".join("".join(out["text"]) for out in outputs if "text" in out)
+        assert [line for line in printed.splitlines() if len(line) > 106] == [], path.name

@@ -1,7 +1,6 @@
 """`memory_plan`: what it predicts against what the compiled programs, Warp and the operating system say; of pair sums, too."""
 
 import dataclasses
-import doctest
 import itertools
 import os
 import subprocess
@@ -315,10 +314,6 @@ def test_the_plan_reads_well():
         "  scratch       1.00 MB",
         "  total        13.35 MB",
     ]
-
-
-def test_example_in_the_docstring():
-    assert doctest.testmod(jfrnn._memory) == (0, 2)
 
 
 @pytest.mark.parametrize(
