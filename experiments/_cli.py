@@ -36,7 +36,7 @@ class Bench(_commands.Commands):
             "distributed": "Time lists, sums and fluids on 1 to k devices.",
             "arrays": "Time the array engine beside jax-md.",
             "latency": "Time calls for few particles.",
-            "lj": "Time a Lennard-Jones liquid, beside jax-md's.",
+            "lj": "Time a Lennard-Jones liquid, beside jax-md, OpenMM and LAMMPS.",
             "options": "Time each option of a search.",
             "peers": "Ask other libraries for the hard cases.",
             "skin": "Time a list that is kept while particles move.",

@@ -78,8 +78,11 @@ def names() -> list[str]:
 
 
 def lacks(name: str) -> str | None:
-    """Say what a method needs that is not installed, None where nothing is missing: found out without importing the method."""
-    return _lacks(f"{__name__}.{name.replace('-', '_')}")
+    """Say what a method needs that is not installed, None where nothing is missing: found out without importing the method.
+
+    A name of no method is that of a package.
+    """
+    return _lacks(f"{__name__}.{name.replace('-', '_')}") if name in names() else _lacks_package(name)
 
 
 @cache

@@ -10,13 +10,13 @@ from collections.abc import Callable
 from pathlib import Path
 
 from experiments._errors import UsageError
-from experiments.pages import answers, configs, cpu, fluids, gpu, jax_md, options, values
+from experiments.pages import answers, configs, cpu, fluids, gpu, jax_md, liquid, options, values
 
 ROOT = Path(__file__).parent.parent.parent
 TABLES: dict[str, Callable[[], str]] = (
-    cpu.TABLES | gpu.TABLES | fluids.TABLES | answers.TABLES | jax_md.TABLES | options.TABLES | configs.TABLES
+    cpu.TABLES | liquid.TABLES | gpu.TABLES | fluids.TABLES | answers.TABLES | jax_md.TABLES | options.TABLES | configs.TABLES
 )
-VALUES = values.VALUES | jax_md.VALUES | options.VALUES
+VALUES = values.VALUES | liquid.VALUES | jax_md.VALUES | options.VALUES
 _PLACE = re.compile(r"(<!-- table ([\w-]+) -->\n)(.*?)(<!-- end -->)", re.DOTALL)
 _UNIT = r"(?:[mnµu]?s|%|[GMk]?B|[GM]iB|times|\N{MULTIPLICATION SIGN}|fold|steps/s|per second|seconds?|minutes?|hours?)"
 _FIGURE = re.compile(rf"(?<![\w.`=-])\d[\d .,]*(?:\s(?:to|and|or)\s\d[\d .,]*)?\s?{_UNIT}(?![\w/])")

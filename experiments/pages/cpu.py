@@ -161,24 +161,6 @@ def answers() -> str:
     return peers.markdown(read("peers/answers.csv"))
 
 
-def liquid() -> str:
-    """Return steps per second of a Lennard-Jones liquid."""
-    ways = {
-        "pair_sum": "`pair_sum`, searches in each step",
-        "pair_sum, list": "`pair_sum(neighbors=)`, list with a skin",
-        "distances, grad": "`distances` and `jax.grad`, list with a skin",
-    }
-    both = {machine(rows): rows for rows in (read("lj/cpu.csv"), read("lj/gpu.csv"))}
-    columns = [(where, n) for where, rows in both.items() for n in dict.fromkeys(row["n"] for row in rows)]
-    lines = []
-    for who, title in ways.items():
-        lines.append([title, *(number((one(both[m], n=n, who=who) or {}).get("steps_per_s")) for m, n in columns)])
-    theirs = {(m, n): [row for row in both[m] if row["n"] == n and row["who"].startswith("jax-md")] for m, n in columns}
-    fastest = [max(float(row["steps_per_s"] or 0) for row in rows) for rows in theirs.values()]
-    lines.append(["jax-md 0.2.29, the faster of its ways", *map(number, fastest)])
-    return markdown(("way", *(f">{where}, {whole(n)}" for where, n in columns)), lines)
-
-
 def structures() -> str:
     """Return seconds of many small structures, one after another, and microseconds of a call."""
     rows = read("structures/cpu.csv")
@@ -245,5 +227,4 @@ TABLES = {
     "empty-space": empty_space,
     "cpu-triangles": triangles,
     "answers": answers,
-    "liquid": liquid,
 }

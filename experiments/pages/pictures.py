@@ -4,6 +4,7 @@ They are drawn from rows whenever the pages are built, so that no picture is old
 """
 
 from pathlib import Path
+from textwrap import fill
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -11,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
 
 from experiments._look import OURS, PEER, dress, factor, head, plain, write_names
-from experiments.pages import cpu, options
+from experiments.pages import cpu, liquid, options
 from experiments.pages.rows import machine, number, one, read, whole
 
 _CPU = ("pair-sum", "warp", "cll", "vesin", "matscipy-neighbours", "scipy-kdtree", "nanoflann-cpp", "nvalchemi")
@@ -19,6 +20,10 @@ _COUNTERS = {"scipy": "SciPy", "hashgrid": "wp.HashGrid"}
 _SPREAD = {  # columns of options, what they are called, and how their lines look
     **{"list_s": ("jfrnn, list", "-o"), "count_s": ("jfrnn, counts", "-s"), "sum_s": ("jfrnn, sum", "-D")},
     **{"beside_count_s": ("one cutoff", ":v"), "scipy_s": ("SciPy", "-^"), "hashgrid_s": ("wp.HashGrid", "-P")},
+}
+_LIQUID = {  # ways, and how their lines look
+    **{"pair_sum, list": "-o", "pair_sum, list, float64": "--o", "pair_sum": "-s", "distances, grad": "-D"},
+    **{"OpenMM": "-^", "LAMMPS lj/cut": "-P", "LAMMPS lj/mdf": "--P", "jax-md dense": "-v", "jax-md ordered sparse": "--v"},
 }
 _GPU = {
     "jfrnn warp": "jfrnn, list",
@@ -30,8 +35,8 @@ _GPU = {
 def draw(folder: Path) -> None:
     """Draw all pictures into a folder."""
     folder.mkdir(parents=True, exist_ok=True)
-    figures = {"steps": _steps(), "spread": _spread()}
-    for name, make in {"cpu": _cpu, "gpu": _gpu, "liquid": _liquid, "cells": _cells, "halo": _halo}.items():
+    figures = {"steps": _steps(), "spread": _spread(), "liquid": _liquid()}
+    for name, make in {"cpu": _cpu, "gpu": _gpu, "cells": _cells, "halo": _halo}.items():
         figures[name] = Figure(figsize=(7.0, 4.2), layout="constrained")
         make(figures[name].add_subplot())
     for name, figure in figures.items():
@@ -86,29 +91,22 @@ def _gpu(axes: Axes) -> None:
     _clear(axes)
 
 
-def _liquid(axes: Axes) -> None:
-    """Draw steps per second of a Lennard-Jones liquid over particles, on a CPU and a GPU."""
-    ends, spans = [], []
-    for file, style in (("cpu", "--"), ("gpu", "-")):
-        rows = [row for row in read(f"lj/{file}.csv") if row["steps_per_s"]]
-        where = machine(rows)
-        found = {}
-        for who, title, color in (("pair_sum, list", "jfrnn", OURS), ("jax-md", "jax-md", PEER)):
-            best: dict[int, float] = {}
-            for row in rows:
-                if row["who"].startswith(who):
-                    best[int(row["n"])] = max(best.get(int(row["n"]), 0.0), float(row["steps_per_s"]))
-            found[title] = best
-            axes.plot(*zip(*sorted(best.items()), strict=True), style, color=color, marker="o" if color == OURS else "s")
-            ends.append((f"{title}, {where}", max(best), best[max(best)], color))
-        ratios = sorted(found["jfrnn"][n] / found["jax-md"][n] for n in found["jfrnn"] if n in found["jax-md"])
-        spans.append(f"{factor(ratios[0])} to {factor(ratios[-1])} times on {'an ' if where.startswith('H') else ''}{where}")
-    axes.set(xscale="log", yscale="log", xlabel="particles of a Lennard-Jones liquid, lists with a skin", ylabel="steps per second")
-    for axis in (axes.xaxis, axes.yaxis):
-        axis.set_major_formatter(lambda value, _: plain(value))
-    _entitle(axes, f"Steps per second over jax-md's: {' and '.join(spans)}")
-    write_names(axes, ends)
-    _clear(axes)
+def _liquid() -> Figure:
+    """Draw steps per second of a Lennard-Jones liquid over particles, a line for each way, a panel for each machine."""
+    figure = Figure(figsize=(7.0, 0.5 + 3.2 * len(liquid.MACHINES)), layout="constrained")
+    for axes, platform in zip(np.ravel(figure.subplots(len(liquid.MACHINES))), liquid.MACHINES, strict=True):
+        rows, ends = liquid.rows_of(platform), []
+        for who, style in _LIQUID.items():
+            points = [(n, float(row["steps_per_s"])) for n, row in sorted(liquid.speeds(rows, who).items())]
+            if points:
+                color = OURS if who in liquid.OURS else PEER
+                axes.plot(*zip(*points, strict=True), style, color=color, ms=5)
+                ends.append((f"jfrnn, {who}" if who in liquid.OURS else who, *points[-1], color))
+        dress(axes, f"particles, {machine(rows)}", "steps per second")
+        axes.set_title(fill(f"jfrnn's list: {liquid.said(platform)}", 90, break_on_hyphens=False), loc="left", fontsize=9)
+        write_names(axes, ends)
+    head(figure, "Steps per second of a Lennard-Jones liquid, over particles")
+    return figure
 
 
 def _spread() -> Figure:

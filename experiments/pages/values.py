@@ -59,16 +59,6 @@ def _jet(what: str) -> Callable[[], str]:
     return value
 
 
-def _liquid() -> str:
-    """Return our steps per second over jax-md's for the smallest liquid on a GPU."""
-    rows = [row for row in read("lj/gpu.csv") if row["steps_per_s"]]
-    least = min(rows, key=lambda row: int(row["n"]))["n"]
-    of_least = [row for row in rows if row["n"] == least]
-    ours = float((one(of_least, who="pair_sum, list") or {})["steps_per_s"])
-    theirs = max(float(row["steps_per_s"]) for row in of_least if row["who"].startswith("jax-md"))
-    return f"{number(ours / theirs)} times jax-md's steps per second among {whole(least)}"
-
-
 def _lead(platform: str) -> Callable[[], str]:
     """Return how many times as fast our list is as vesin's on the thesis's full lattice, or as nvalchemi's on a GPU."""
 
@@ -128,7 +118,6 @@ VALUES: dict[str, Callable[[], str]] = {
     "jet-particles": _jet("particles"),
     "jet-steps": _jet("steps"),
     "jet-seconds": _jet("seconds"),
-    "gpu-liquid": _liquid,
     "lead-cpu": _lead("cpu"),
     "lead-gpu": _lead("gpu"),
     "density-64m-ms": _density("ms"),
