@@ -27,7 +27,7 @@ class NeighborListMultiImage(custom_partition.NeighborListMultiImage):
         idx: Dense: neighbors j, shape [n, max_occupancy]; else a tuple of particles i and neighbors j, [max_occupancy] each, int32.
             Unused places hold n. OrderedSparse holds of (i, j, S) and (j, i, -S) the one whose S has a positive number first, and
             of S = 0 the one with i < j.
-        shifts: Whole numbers S [..., d], of the dtype of positions: pairs are r_j + S @ box.T - r_i apart.
+        shifts: Whole numbers S [..., d], int32: pairs are r_j + S @ box.T - r_i apart.
         reference_position: Positions when the list was last rebuilt, shape [n, d].
         reference_box: The box at that time, shape [d, d].
         box: The present box, shape [d, d].
@@ -57,8 +57,7 @@ def neighbor_list_multi_image(
 
     Args:
         displacement_or_metric: Not used.
-        box: A matrix [d, d] whose columns are the lattice vectors [length], or edge lengths; d is 2 or 3; for a matrix [1, 1], the
-            function of jax-md is called, where it is installed.
+        box: A matrix [d, d] whose columns are the lattice vectors [length], or edge lengths.
         r_cutoff: As in `neighbor_list`, and dr_threshold, capacity_multiplier and fractional_coordinates likewise.
         dr_threshold: As in `neighbor_list`.
         capacity_multiplier: As in `neighbor_list`.
@@ -69,15 +68,13 @@ def neighbor_list_multi_image(
         **kwargs: Not used, as in jax-md.
 
     Returns:
-        A `NeighborListMultiImageFns`, the lists of which are `NeighborListMultiImage`; both functions take box=.
+        A `NeighborListMultiImageFns`, the lists of which are `NeighborListMultiImage`; both functions take box=. In 1D, and of
+        positions of float16 or bfloat16, `allocate` returns a list of jax-md's own, decided by its arithmetic.
 
     Raises:
-        ValueError, TypeError: an argument is of the wrong kind, shape or range.
+        ValueError, TypeError: an argument is of the wrong kind, shape or range, or is for jax-md's own list and it is not installed.
     """
     form, cutoff, skin = check_format(format), float(r_cutoff), float(dr_threshold)
-    if np.shape(box) == (1, 1) and _theirs is not None:
-        given = (displacement_or_metric, box, cutoff, skin, capacity_multiplier, pbc, fractional_coordinates, ordered, form)
-        return _theirs(*given)
     form = OrderedSparse if ordered and form is Sparse else form
 
     def box_of(box: Given, dim: int, like: Box | None = None) -> tuple[Array, Box]:
@@ -102,15 +99,15 @@ def neighbor_list_multi_image(
         if form is Dense:
             more = ((0, 0), (0, max(room - kept.capacity, 0)))
             idx, shifts = jnp.pad(kept.idx, more, constant_values=n)[:, :room], jnp.pad(shifts, (*more, (0, 0)))[:, :room]
-            return idx, shifts.astype(position.dtype), jnp.max(kept.count, initial=0)
+            return idx, shifts, jnp.max(kept.count, initial=0)
         if 0 in used.shape:
             none = jnp.full(room, n, jnp.int32)
-            return (none, none), jnp.zeros((room, shifts.shape[-1]), position.dtype), jnp.int32(0)
+            return (none, none), jnp.zeros((room, shifts.shape[-1]), jnp.int32), jnp.int32(0)
         flat = flatten(used, room)
         real_pair = flat.rows < n
         senders = jnp.where(real_pair, kept.idx.reshape(-1)[flat.slots], n)
         shifts = jnp.where(real_pair[:, None], shifts.reshape(used.size, -1)[flat.slots], 0)
-        return (flat.rows, senders), shifts.astype(position.dtype), flat.offsets[-1]
+        return (flat.rows, senders), shifts, flat.offsets[-1]
 
     def made_of(fields: tuple[Any, ...], overflow: Array, kept: Kept, room: int) -> NeighborListMultiImage:
         return NeighborListMultiImage(*fields, None, form, room, update, overflow, kept=kept)  # pyright: ignore
@@ -118,11 +115,15 @@ def neighbor_list_multi_image(
     def allocate(position: Array, extra_capacity: int = 0, box: Given = box, **given: Given) -> NeighborListMultiImage:
         position = jnp.asarray(position)
         n, dim = position.shape
-        if dim not in (2, 3):
-            raise ValueError(
-                f"position must have shape [n, 2] or [n, 3], got {list(position.shape)}: in 1D, install jax-md, and pass box as a "
-                "matrix [1, 1]; the list is then jax-md's own."
-            )
+        if dim not in (2, 3) or position.dtype in (np.float16, jnp.bfloat16):
+            if _theirs is None:
+                raise TypeError(
+                    "position must have shape [n, 2] or [n, 3] and dtype float32 or float64, got "
+                    f"{list(position.shape)} and {position.dtype}: of others, install jax-md, which then makes the list itself."
+                )
+            matrix = jnp.asarray(box) if np.ndim(box) == 2 else jnp.eye(dim) * jnp.asarray(box)
+            own = _theirs(None, matrix, cutoff, skin, capacity_multiplier, pbc, fractional_coordinates, format=form)
+            return own.allocate(position, extra_capacity)
         matrix, made = box_of(box, dim)
         kept = search(position, cutoff, box=made, skin=skin, slack=max(float(capacity_multiplier), 1.0))
         kept.check()
@@ -134,6 +135,8 @@ def neighbor_list_multi_image(
         return made_of((idx, shifts, position, matrix, matrix), held > room, kept, room)
 
     def update(position: Array, neighbors: NeighborListMultiImage, box: Given = None, **given: Given) -> NeighborListMultiImage:
+        if not isinstance(neighbors, NeighborListMultiImage):  # jax-md's own
+            return neighbors.update(position, **{} if box is None else {"box": box})
         position, room, old = jnp.asarray(position), neighbors.max_occupancy, neighbors.kept
         matrix, made = box_of(neighbors.box if box is None else box, position.shape[1], old.box)
         kept = old.update(position, box=made)

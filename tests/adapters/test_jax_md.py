@@ -181,8 +181,6 @@ def test_boxes_that_change():
         nbrs.update(x, perturbation=jnp.eye(3))
     with pytest.raises(ValueError, match="displacement_or_metric given"):
         jax_md.neighbor_list(None, 1.0, CUTOFF).allocate(x)
-    with pytest.raises(ValueError, match="in 1D, install jax-md"):
-        jax_md.neighbor_list_multi_image(None, 1.0, CUTOFF).allocate(x[:, :1])
     with pytest.raises(ValueError, match="format must be a member of NeighborListFormat"):
         jax_md.neighbor_list(None, 1.0, CUTOFF, format="Dense")
     with pytest.raises(TypeError, match=r"cannot run inside jax.jit"):
@@ -272,9 +270,26 @@ def test_several_images(form, fractional):
         found = list(zip(i.tolist(), j.tolist(), map(tuple, s.astype(int).tolist())))
         assert set(found) == within
         assert len(found) == len(within) == nbrs.n_edges
-        assert not nbrs.did_buffer_overflow
+        assert (nbrs.shifts.dtype, bool(nbrs.did_buffer_overflow)) == (np.int32, False)
     assert update(given, nbrs, 0.2 * matrix).did_buffer_overflow
     assert update(lost, nbrs, matrix).did_buffer_overflow  # though there is room for all that are found
+
+
+@pytest.mark.filterwarnings("ignore:scatter inputs have incompatible types")  # in jax-md, of its int32 and int64
+@pytest.mark.parametrize(("dim", "dtype"), [(1, np.float32), (3, np.float16), (3, jnp.bfloat16)])
+def test_several_images_by_jax_md_itself(dim, dtype):
+    """In 1D, and of positions of two bytes, where its arithmetic decides; without it, an error says so."""
+    x, fns = jnp.asarray(points(True, 12)[:, :dim], dtype), jax_md.neighbor_list_multi_image(None, 1.7, 1.2, SKIN)
+    with jax.numpy_dtype_promotion("standard"):
+        own = getattr(jax_md, "estimate_max_neighbors", None) and pytest.importorskip("jax_md").custom_partition
+        if own is None:
+            with pytest.raises(TypeError, match=r"got \[12, \d\] and .*float\d\d: of others, install jax-md"):
+                fns.allocate(x)
+            return
+        made = own.neighbor_list_multi_image(None, 1.7 * jnp.eye(dim), 1.2, SKIN).allocate(x)
+        for nbrs, other in ((fns.allocate(x), made), (fns.update(x + dtype(0.2), fns.allocate(x)), made.update(x + dtype(0.2)))):
+            assert isinstance(nbrs, own.NeighborListMultiImage)
+            jax.tree.map(np.testing.assert_array_equal, nbrs, other.set(update_fn=nbrs.update_fn))
 
 
 @pytest.fixture(scope="module")
