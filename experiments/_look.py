@@ -16,7 +16,7 @@ COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#00
 """What is no method, but an angle, a layout or a stage: colors of M. Okabe and K. Ito, distinct to color-blind eyes too."""
 PEERS_COLORS = ("#C44E00", "#00805C", "#B0578D", "#8F6500", "#6A51A3", "#8C4A3C", "#4F7F1C", "0.4")
 """Of other methods of a picture, in order: as text they can be read on white."""
-MARKERS = "osD^vPXp"
+MARKERS = "osD^vPXp<"
 MOST = 8  # methods in a picture
 WIDTH = 7.0  # of a picture that is to be read when it is 700 pixels wide [inches]
 NAMES = {  # of our methods, those that lead first

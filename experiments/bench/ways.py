@@ -247,15 +247,27 @@ def _steps_of_list(given: Given, gradient: bool, compensated: bool) -> Steps:
     return Steps(_our_list(given), _compile(lambda x, m, nbrs: over_list(kernel, x, m, nbrs.idx), gradient))
 
 
-def _pair_sum_listed(given: Given, gradient: bool, compensated: bool) -> Steps:
+def _our_flat_list(given: Given) -> Callable[[Any], Any]:
+    import jax
+
     import jfrnn
 
-    kernel = poly6(given.cutoff)
+    total, cutoff = jfrnn.search_edges(given.x, given.cutoff).total, given.cutoff
+    return jax.jit(lambda x: jfrnn.search_edges(x, cutoff, total=total))
 
-    def density(x: Any, m: Any, nbrs: Any) -> Any:  # noqa: ANN401
-        return jfrnn.pair_sum(kernel, x, None, m, neighbors=nbrs, compensated=compensated)
 
-    return Steps(_our_list(given), _compile(density, gradient))
+def _pair_sum_over(make: Callable[[Given], Callable[[Any], Any]]) -> Callable[[Given, bool, bool], Steps]:
+    def prepare(given: Given, gradient: bool, compensated: bool) -> Steps:
+        import jfrnn
+
+        kernel = poly6(given.cutoff)
+
+        def density(x: Any, m: Any, nbrs: Any) -> Any:  # noqa: ANN401
+            return jfrnn.pair_sum(kernel, x, None, m, neighbors=nbrs, compensated=compensated)
+
+        return Steps(make(given), _compile(density, gradient))
+
+    return prepare
 
 
 def _jax_md(given: Given, gradient: bool, compensated: bool) -> Steps:
@@ -296,10 +308,11 @@ WAYS = {
     "pair_sum jax": Way(_steps_without_list("jax"), compensates=True),
     "brute force": Way(_steps_without_list("brute"), compensates=True),
     "list, sum": Way(_steps_of_list),
-    "list, pair_sum": Way(_pair_sum_listed, compensates=True),
+    "list, pair_sum": Way(_pair_sum_over(_our_list), compensates=True),
     "jax-md list, sum": Way(_jax_md, "jax-md"),
     "nvalchemi list, sum": Way(_nvalchemi, "nvalchemi-toolkit-ops"),
     "scipy pairs alone": Way(_scipy, "scipy", sums=False),
+    "flat list, pair_sum": Way(_pair_sum_over(_our_flat_list), compensates=True),
 }
 
 

@@ -99,6 +99,7 @@ def sums() -> str:
         ("pair_sum warp", True): "the same, compensated",
         ("list, sum", False): "padded list, then a sum in plain JAX",
         ("list, pair_sum", False): "list, `pair_sum(neighbors=)`, before a kernel read the list",
+        ("flat list, pair_sum", False): "flat list, `pair_sum(neighbors=)`, an array program",
         ("pair_sum jax", False): "`pair_sum`, `jax`",
         ("nvalchemi list, sum", False): "nvalchemi's list, then the sum",
         ("scipy pairs alone", False): "SciPy's pairs alone, no sum",
@@ -107,7 +108,8 @@ def sums() -> str:
     for (way, compensated), title in ways.items():
         of_way = [one(rows, way=way, compensated=compensated, sums=what) for what in ("density", "density, gradient")]
         cells = [(number(r["seconds"], 1e3), number(r["B per particle"])) if r else ("", "") for r in of_way]
-        lines.append([title, *(cell for pair in cells for cell in pair)])
+        if any(of_way):
+            lines.append([title, *(cell for pair in cells for cell in pair)])
     return markdown(("way", ">density [ms]", ">B per particle", ">and gradient [ms]", ">B per particle"), lines)
 
 

@@ -119,10 +119,12 @@ def neighbor_list(
         flat = flatten(used, room)
         return jnp.stack([jnp.where(flat.rows < n, rows.reshape(-1)[flat.slots], n), flat.rows]), flat.offsets[-1]
 
-    @jax.jit  # as in jax-md: XLA rounds numbers of bfloat16 less often in a program
-    def are_near(position: Array, rows: Array, **kwargs: Given) -> Array:
-        of_row = jax.vmap(functools.partial(squared, **kwargs), (None, 0))
-        return jax.vmap(of_row)(position, position[rows]) < reach**2
+    @functools.partial(jax.jit, static_argnames="cells")  # as in jax-md: XLA rounds numbers of bfloat16 less often in a program
+    def are_near(position: Array, rows: Array, cells: bool, kwargs: dict[str, Given]) -> Array:
+        ask = functools.partial(squared, **kwargs)
+        orders = [ask] * (cells or form is not Dense) + [lambda a, b: ask(b, a)] * (form is Dense)  # in which jax-md asks
+        near = [jax.vmap(jax.vmap(order, (None, 0)))(position, position[rows]) < reach**2 for order in orders]
+        return functools.reduce(jnp.logical_and, near)
 
     def rows_of(position: Array, kept: Kept | None, exact: bool, kwargs: dict[str, Given]) -> Array:
         """Return the neighbors of each particle, where n means none."""
@@ -130,7 +132,7 @@ def neighbor_list(
             return kept.idx
         n, own = len(position), jnp.arange(len(position), dtype=jnp.int32)
         rows = jnp.broadcast_to(own, (n, n)) if kept is None else kept.idx
-        near = (rows < n) & are_near(position, rows, **kwargs)
+        near = (rows < n) & are_near(position, rows, kept is not None, kwargs)
         near = near & (rows != own[:, None]) if mask_self else near
         return jnp.where(near, rows, n)
 

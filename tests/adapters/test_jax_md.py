@@ -231,10 +231,15 @@ def test_the_function_chooses(displacement):
     x = np.random.default_rng(4).random((400, 3)) * EDGE
     away = np.linalg.norm(displacement(x[:, None], x, np), axis=2)
     apart = displacement is not cubic
-    near = {(i, j) for i, j in zip(*np.nonzero(away < CUTOFF)) if i != j or not apart}
+    near = (away < CUTOFF) & (away.T < CUTOFF)  # as jax-md, which asks in both orders where it has cells
+    near = {(i, j) for i, j in zip(*np.nonzero(near)) if i != j or not apart}
     nbrs = jax_md.neighbor_list(jax.jit(displacement), EDGE, CUTOFF, mask_self=apart).allocate(x)
     assert nbrs.kept is not None
     assert pairs_of(nbrs.idx, 400, jax_md.Dense) == near
+    for form, order in ((jax_md.Dense, (0, 1)), (jax_md.Sparse, (1, 0))):  # without cells in one: of (j, i) in rows
+        every = jax_md.neighbor_list(displacement, EDGE, CUTOFF, mask_self=False, disable_cell_list=True, format=form).allocate(x)
+        of_pairs = np.argwhere(away.T < CUTOFF if order[0] == 0 else away < CUTOFF)
+        assert pairs_of(every.idx, 400, form) == set(map(tuple, of_pairs.tolist()))
 
 
 IMAGES_OFTEN = [(jax_md.Dense, True)]  # pairs one after another, and no fractions: of particles that nobody wrapped
