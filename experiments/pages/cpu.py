@@ -187,6 +187,13 @@ def structures() -> str:
     return markdown(("library", *heads), table)
 
 
+def crystal_ties() -> str:
+    """Return how many pairs each library misses or has too many in crystals full of distances at the cutoff."""
+    heads = ("library", ">crystals", ">pairs", ">distances at the cutoff", ">misses", ">has too many")
+    rows = read("structures/ties.csv")
+    return markdown(heads, [[f"{row['library']} {row['version']}".strip(), *map(whole, [*row.values()][2:])] for row in rows])
+
+
 def crystals(file: str) -> str:
     """Return milliseconds of batches of crystals, each in a skewed cell of its own."""
     rows = [row for row in read(f"crystals/{file}.csv") if row["status"] == "ok"]
@@ -219,6 +226,7 @@ def first_call() -> str:
 
 TABLES = {
     "structures": structures,
+    "crystal-ties": crystal_ties,
     "crystals": partial(crystals, "cpu"),
     "first-call": first_call,
     "cpu-known": search_known,

@@ -72,7 +72,7 @@ def neighbor_list_multi_image(
         positions of float16 or bfloat16, `allocate` returns a list of jax-md's own, decided by its arithmetic.
 
     Raises:
-        ValueError, TypeError: an argument is of the wrong kind, shape or range, or jax-md's own list is asked for and not installed.
+        ValueError, TypeError: an argument is of the wrong kind, shape or range, or jax-md's own list is needed and not there.
     """
     form, cutoff, skin = check_format(format), float(r_cutoff), float(dr_threshold)
     form = OrderedSparse if ordered and form is Sparse else form
