@@ -6,16 +6,18 @@ from typing import NamedTuple
 import numpy as np
 
 REFERENCE = Path(__file__).parent.parent / "reference"
-DRAG = np.pi**2 * 100.0  # of the channel's slowest mode [1/s]: ν π²/H² with ν = 100 m²/s, H = 1 m
+DRAG = np.pi**2 * 100.0  # of the slowest mode of a channel [1/s]: ν π²/H² with ν = 100 m²/s, H = 1 m
 
 
-def poiseuille(y: np.ndarray, time: float, top_speed: float = 1.25) -> np.ndarray:
-    """Return the velocity [m/s] between plates at rest, y in [0, 1] m, after the force was switched on (ν = 100 m²/s).
+def poiseuille(y: np.ndarray, time: float, top_speed: float = 1.25, drag: float = DRAG) -> np.ndarray:
+    """Return the velocity [m/s] between plates at rest, y in [0, 1] of their distance H, after a force of 8ν top_speed/H² began.
+
+    `drag` is νπ²/H² [1/s].
 
     Source: Morris, Fox & Zhu (1997), doi:10.1006/jcph.1997.5776, eq. 31.
     """
     k = np.arange(1, 200, 2)
-    modes = np.sin(np.pi * k * y[:, None]) * np.exp(-DRAG * k**2 * time) / k**3
+    modes = np.sin(np.pi * k * y[:, None]) * np.exp(-drag * k**2 * time) / k**3
     return 4 * top_speed * (y * (1 - y) - 8 / np.pi**3 * modes.sum(axis=1))
 
 
@@ -27,6 +29,19 @@ def couette(y: np.ndarray, time: float, lid: float = 1.25) -> np.ndarray:
     k = np.arange(1, 200)
     modes = (-1.0) ** k / k * np.sin(np.pi * k * y[:, None]) * np.exp(-DRAG * k**2 * time)
     return lid * (y + 2 / np.pi * modes.sum(axis=1))
+
+
+def rotor(r: np.ndarray, rate: float, inner: float, outer: float) -> np.ndarray:
+    """Return the velocity [m/s] along circles of radii r between a rod of radius `inner` that turns and a tube of radius `outer`.
+
+    Source: Couette (1890), Ann. Chim. Phys. 21, 433; Landau & Lifshitz, Fluid Mechanics, §18.
+    """
+    return rate * inner**2 / (outer**2 - inner**2) * (outer**2 / r - r)
+
+
+def rotor_torque(viscosity: float, rate: float, inner: float, outer: float) -> float:
+    """Return the torque on that rod per length and density of the fluid, 4πνω R1²R2²/(R2² - R1²), against its turning."""
+    return 4 * np.pi * viscosity * rate * inner**2 * outer**2 / (outer**2 - inner**2)
 
 
 def drop_axis(times: np.ndarray, rate: float = 100.0) -> np.ndarray:

@@ -48,8 +48,9 @@ def run(names: list[str], folder: Path) -> list[CaseRow]:
 
 def measure(name: str, case: Case, say: Any = print) -> CaseRow:  # noqa: ANN401
     """Run a case and judge it; a run that diverges makes a row that says so."""
-    scene = SCENES[case.scene](**case.settings)
-    model, start, step, seen = make_model(scene, backend=case.backend), perf_counter(), 0, []
+    make = SCENES[case.scene] if isinstance(case.scene, str) else case.scene
+    scene = make(**case.settings)
+    model, start, step, seen = make_model(scene, backend=case.backend, force=case.force), perf_counter(), 0, []
     s = jax.jit(solver.begin)(model, make_state(scene))
     reason = None
     for time in case.times:

@@ -11,9 +11,9 @@ import numpy as np
 from jax import Array
 
 from experiments._library import taylor_green_velocity
-from experiments.sph import answers, potential
+from experiments.sph import answers, potential, scenes, vortices
 from jfrnn.cases.fluids import FluidScene, GasScene, Scene
-from jfrnn.sph import solver
+from jfrnn.sph import probes, solver
 from jfrnn.sph.particles import Flow, State
 
 Curves = dict[str, list[list[float]]]
@@ -22,7 +22,8 @@ Curves = dict[str, list[list[float]]]
 class Seen(NamedTuple):
     """The fluid at a moment: time [s], positions, velocities, pressures, kinetic and potential energy [J]; no walls.
 
-    A gas has also densities, its thermal energy [J], and its largest smoothing length over the smallest.
+    A gas has also densities, its thermal energy [J], and its largest smoothing length over the smallest; a fluid beside a wall of
+    segments the torque on it [N].
     """
 
     time: float
@@ -34,6 +35,7 @@ class Seen(NamedTuple):
     rho: np.ndarray | None = None
     thermal: float = 0.0
     resolution: float = 1.0
+    torque: float = 0.0
 
 
 class Figure(NamedTuple):
@@ -55,32 +57,37 @@ class Case:
     """A scene, when it is looked at, and what is said about what was seen.
 
     Attributes:
-        scene: Name of a scene.
+        scene: Name of a scene, or what makes one.
         times: When it is looked at [s].
         judge: (scene, what was seen) -> figures, and curves by name, each [x, y], for the picture.
         settings: Of the scene.
         backend: Of `jfrnn.pair_sum`.
         axes: What the picture has along its axes.
+        force: An own force, as `make_model` takes it.
     """
 
-    scene: str
+    scene: str | Callable[..., FluidScene]
     times: tuple[float, ...]
     judge: Callable[[Any, list[Seen]], tuple[list[Figure], Curves]]
     settings: dict[str, Any] = field(default_factory=dict)
     backend: str = "auto"
     axes: tuple[str, str] = ("time [s]", "energy [J]")
+    force: Callable[[State], Array] | None = None
 
 
 @jax.jit
 def _measures(model: Flow, s: State) -> tuple[Array, Array, dict[str, Array]]:
-    return *solver.density_and_pressure(model, s), solver.energies(model, s)
+    held = solver.energies(model, s)
+    if s.solid is not None:
+        held["torque"] = probes.force_on_solid()(model, s)["torque"]
+    return *solver.density_and_pressure(model, s), held
 
 
 def look(scene: Scene, model: Flow, s: State) -> Seen:
     """Return what is to be seen of a state."""
     fluid = np.ones(scene.n, bool) if scene.wall is None else ~scene.wall
     rho, p, energies = _measures(model, s)
-    held = {name: float(energies.get(name, 0)) for name in ("kinetic", "potential", "thermal")}
+    held = {name: float(energies.get(name, 0)) for name in ("kinetic", "potential", "thermal", "torque")}
     x, v, p, rho = (np.asarray(each)[fluid] for each in (s.x, s.v, p, rho))
     return Seen(float(s.time), x, v, p, rho=rho, resolution=1.0 if s.gas is None else float(s.gas.h.max() / s.gas.h.min()), **held)
 
@@ -126,6 +133,63 @@ def taylor_green(scene: FluidScene, seen: list[Seen]) -> tuple[list[Figure], Cur
         Figure("l1 of speed, t = 2", l1, None, 0.04 if coarse else 0.01),
     ]
     return figures, {"measured": curve(times, kinetic), "known": curve(times, exact)}
+
+
+def vortices_in_3d(scene: FluidScene, seen: list[Seen]) -> tuple[list[Figure], Curves]:
+    """Kinetic energy and its dissipation, between the times looked at, against a computation with a Fourier series."""
+    assert scene.physics.viscosity is not None, "what dissipates"
+    times, kinetic = 2 * np.pi * np.array([at.time for at in seen]), np.array([at.kinetic for at in seen])
+    near = np.round(times / vortices.STEP) * vortices.STEP  # less than a step of the particles away
+    energies, rates = vortices.energies(near, 1 / (2 * np.pi * scene.physics.viscosity))
+    known = energies - rates * (times - near)
+    found, exact = (-np.diff(each) / np.diff(times) for each in (kinetic, known))
+    energy, rate = {16: (0.03, 0.05), 32: (0.01, 0.02)}.get(round(1 / scene.spacing), (0.005, 0.01))
+    figures = [
+        Figure("kinetic energy, largest relative error, t ≤ 10/kU", float(np.abs(kinetic / known - 1).max()), None, energy),
+        Figure("dissipation, relative L2, t ≤ 10/kU", relative(found, exact), None, rate),
+        Figure("largest dissipation over known", float(found.max() / exact.max()), 1 - energy, 1 + energy),
+    ]
+    middles = (times[1:] + times[:-1]) / 2
+    return figures, {"measured": curve(middles, found), "known": curve(near, rates)}
+
+
+def reverse_poiseuille(scene: FluidScene, seen: list[Seen]) -> tuple[list[Figure], Curves]:
+    """Profiles of two flows beside each other, against that between plates."""
+    drag = np.pi**2 * scenes.SPEED / scenes.REYNOLDS / scenes.WIDTH
+
+    def exact(y: np.ndarray, time: float) -> np.ndarray:
+        y = y / scenes.WIDTH % 2
+        return np.where(y < 1, 1, -1) * answers.poiseuille(y % 1, time, scenes.SPEED, drag)
+
+    curves, errors, y = {}, [], np.linspace(0, 1, 81)
+    for at in seen:
+        known = exact(at.x[:, 1], at.time)
+        errors.append(relative(at.v, np.stack([known, 0 * known], axis=1)))
+        curves[f"t = {at.time:.2g} s, measured"] = means(at.x[:, 1] % 1, at.v[:, 0], np.linspace(0, 1, 41))
+        curves[f"t = {at.time:.2g} s, known"] = curve(y, exact(y, at.time))
+    target = 0.02 if scene.spacing > 1 / 40 else 0.01
+    figures = [
+        Figure(f"velocity, relative L2, t = {seen[-1].time:.2g}", errors[-1], None, target),
+        Figure("velocity, relative L2, largest of all times", max(errors), None, target),
+    ]
+    return figures, curves
+
+
+def rotor(scene: FluidScene, seen: list[Seen]) -> tuple[list[Figure], Curves]:
+    """Torque on a rod that turns in a tube, and the velocities between them, when the flow is steady."""
+    rod = scenes.RATE, scenes.INNER, scenes.OUTER
+    last, torque = seen[-1], -answers.rotor_torque(scenes.FRICTION, *rod)
+    r = np.linalg.norm(last.x, axis=1)
+    around = (last.x[:, 0] * last.v[:, 1] - last.x[:, 1] * last.v[:, 0]) / r
+    line = np.linspace(scenes.INNER, scenes.OUTER, 51)
+    figures = [
+        Figure(f"torque, relative error, t = {last.time:.2g}", abs(last.torque / torque - 1), None, 0.01),
+        Figure(f"velocity, relative L2, t = {last.time:.2g}", relative(around, answers.rotor(r, *rod)), None, 0.01),
+    ]
+    return figures, {
+        "measured": means(r, around, np.linspace(scenes.INNER, scenes.OUTER, 21)),
+        "known": curve(line, answers.rotor(line, *rod)),
+    }
 
 
 def channel(scene: FluidScene, seen: list[Seen]) -> tuple[list[Figure], Curves]:
@@ -269,6 +333,7 @@ def _times(end: float, count: int) -> tuple[float, ...]:
 
 _held_back = functools.partial(dam_break, perfect=False)
 _CHANNEL = (2e-4, 5e-4, 1e-3, 2e-3, 5e-3, 1e-2)
+_BRACHET = tuple(k / 4 / np.pi for k in range(21))  # t = 0 to 10 in 1/(kU), k = 2π/m: Re 100 of Brachet et al. (1983)
 _PROFILE = ("y [m]", "velocity [m/s]")
 _FEW_TIMES = (1e-4, *(0.01 * k for k in range(1, 201)))
 _FRONT = ("t √(2g/a)", "front [column widths]")
@@ -295,9 +360,29 @@ CASES = {
         f"dam-break-viscous-{nx}": Case("dam-break-2d", _times(0.8, 80), _held_back, {"nx": nx, "artificial": alpha}, axes=_FRONT)
         for nx, alpha in ((20, 0.2), (40, 0.4))  # α times smoothing length, a viscosity, is the same
     },
+    **{
+        f"reverse-poiseuille-{nx}": Case(
+            scenes.reverse_poiseuille, (0.25, 0.5, 1.0, 2.5), reverse_poiseuille, {"nx": nx}, axes=_PROFILE, force=scenes.reverse
+        )
+        for nx in (20, 40)
+    },
+    **{
+        f"rotor-{layers}": Case(scenes.rotor, (1.0, 2.0), rotor, {"layers": layers}, axes=("r [m]", "velocity [m/s]"))
+        for layers in (10, 20, 40)
+    },
     "sedov": Case("sedov", (0.05, 0.1, 0.15), sedov, axes=("r [m]", "density [kg/m²]")),
     "couette": Case("couette", _CHANNEL, channel, axes=_PROFILE),
     "poiseuille": Case("poiseuille", _CHANNEL, channel, axes=_PROFILE),
     "cavity": Case("cavity", _times(25.0, 25), cavity, axes=("y, x [m]", "velocity [m/s]")),
+    **{
+        f"taylor-green-3d-{nx}": Case(
+            "taylor-green",
+            _BRACHET,
+            vortices_in_3d,
+            {"nx": nx, "dim": 3, "reynolds": 200 * np.pi, "jitter": 0.2},
+            axes=("t kU", "dissipation [kU³]"),
+        )
+        for nx in (16, 32, 64)
+    },
 }
 """By name, long ones last."""

@@ -230,9 +230,10 @@ def _even(model: Model, s: State, rho: Array, nbrs: Neighbors) -> Array:
 
 
 def _mean_pressure(model: Model, s: State, p: Array, nbrs: Neighbors) -> Array:
-    """Return the mean pressure [Pa] of each particle and its neighbors, shape [n].
+    """Return Σ_j p_j/N_i [Pa], shape [n]: the plain mean over the N_i particles that the kernel reaches, i and walls among them.
 
-    Source: Basa, Quinlan & Lastiwka (2009), doi:10.1002/fld.1927; Ramachandran & Puri (2019), doi:10.1016/j.compfluid.2018.11.023.
+    Source: Ramachandran & Puri (2019), doi:10.1016/j.compfluid.2018.11.023, of whose momentum equation for flows without a free
+    surface it is the average pressure, after Basa, Quinlan & Lastiwka (2009), doi:10.1002/fld.1927.
     """
     sums = _sum(lambda pair, i, j: {"p": j["p"], "n": jnp.ones_like(j["p"])}, model, s, {"p": p}, nbrs)
     return (sums["p"] + p) / (sums["n"] + 1)

@@ -47,7 +47,8 @@ def source(pair: Pair, i: Values, j: Values) -> Array:
 def less_mean(i: Values, j: Values) -> tuple[Values, Values]:
     """Return both with pressures less `mean` of i, which the sum does not feel where particles lie evenly; momentum is not kept.
 
-    Source: Basa, Quinlan & Lastiwka (2009), doi:10.1002/fld.1927.
+    In `volume`, p_ij is then (ρ_j (p_i - p̄_i) + ρ_i (p_j - p̄_i))/(ρ_i + ρ_j). Source: Ramachandran & Puri (2019),
+    doi:10.1016/j.compfluid.2018.11.023, after Basa, Quinlan & Lastiwka (2009), doi:10.1002/fld.1927.
     """
     return i | {"p": i["p"] - i["mean"]}, j | {"p": j["p"] - i["mean"]}
 

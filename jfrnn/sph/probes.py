@@ -79,7 +79,8 @@ def force_on_walls(about: Sequence[float] | None = None) -> Probe:
     """Return a probe of the force [N] on all walls, of dummies and of triangles, and of its torque [N m].
 
     What the walls do to the fluid is what is left of Σ m a without gravity and an own force. So it is right for forms of pressure
-    and viscosity that keep momentum, without damping, and torque as far as forces of pairs are along their distances.
+    and viscosity that keep momentum, without damping, and torque as far as forces of pairs are along their distances, which viscous
+    ones are not: beside triangles, take `force_on_solid`.
 
     Args:
         about: What torque is taken about [m], d numbers; None: the origin.
@@ -100,7 +101,7 @@ def force_on_walls(about: Sequence[float] | None = None) -> Probe:
 
 
 def force_on_solid(about: Sequence[float] | None = None) -> Probe:
-    """Return a probe of the force [N] on the wall of triangles, and of its torque [N m]: exactly what it does to the fluid, turned.
+    """Return a probe of the force [N] on the wall of triangles, and of its torque [N m], from pressures and viscosity at the wall.
 
     Args:
         about: As in `force_on_walls`.
@@ -112,8 +113,8 @@ def force_on_solid(about: Sequence[float] | None = None) -> Probe:
     def probe(model: Model, s: State) -> dict[str, Array]:
         if s.solid is None:
             raise SceneError("solid must be there for a probe of the force on it, got None.")
-        rho, p = solver.density_and_pressure(model, s)
-        return _force_and_torque(-mass_there(model, s)[:, None] * solids.push(model, s, s.solid, rho, p), s.x, about)
+        onto, points = solids.load(model, s, s.solid, *solver.density_and_pressure(model, s))
+        return _force_and_torque(mass_there(model, s)[:, None] * onto, points, about)
 
     return probe
 

@@ -280,6 +280,20 @@ def push(model: Model, s: State, beside: Beside, rho: Array, p: Array) -> Array:
     return a
 
 
+def load(model: Model, s: State, beside: Beside, rho: Array, p: Array) -> tuple[Array, Array]:
+    """Return what the fluid does to the wall, per mass of each particle [m/s²], and at which points [m]; shape [n, d] each.
+
+    It is `push`, turned, and 2ν A n × ω on a wall that turns at ω: the viscous stress is that of the gradient and its transpose, of
+    which a Laplacian needs the first only. The second changes neither the flow nor the force on a solid that is wet all around, but
+    takes 2μω times its volume off the torque, as in a fluid that turns with it and does nothing to it.
+    """
+    wall, onto = _find_acting(model, s, beside), -push(model, s, beside, rho, p)
+    if model.turning is not None and model.physics.viscosity is not None and not model.physics.slip:
+        spin = model.turning.rate * _across(wall.normal, model.turning)
+        onto = onto - (2 * model.physics.viscosity * wall.area)[:, None] * spin
+    return onto, s.x - wall.distance[:, None] * wall.normal
+
+
 def rim_speed(model: Model, beside: Beside) -> Array:
     """Return the largest speed of the wall [m/s], shape []."""
     corners = beside.tri.vertices

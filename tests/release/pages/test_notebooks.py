@@ -67,7 +67,7 @@ SAYS = {  # pictures, and what each prints
     "pair_sums": (2, ("sums per rebuild on", "one pair sum with backend='warp'")),
     "sph_gradients": (6, ("at the best ε", "m²/s was the first guess", "first guess [1. 0.]", "forces:")),
     "sph_jet": (2, ("particles of oil", "operations in a step", "kinetic energy", "neighbors on average")),
-    "sph_validation": (6, ("a perfect fluid is ahead of the experiment", "energy kept to")),
+    "sph_validation": (7, ("a perfect fluid is ahead of the experiment", "energy kept to")),
 }
 
 

@@ -1,12 +1,16 @@
 """Parts of the SPH solver, each alone: kernels, equations of state, terms of pairs, corrections, walls."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jfrnn.sph import correction, density, pressure, states, surface, transport, viscosity, walls
+from jfrnn.cases import fluids
+from jfrnn.sph import correction, density, pressure, solver, states, surface, transport, viscosity, walls
 from jfrnn.sph.kernels import KERNELS
+from jfrnn.sph.model import make_model, make_state
 from jfrnn.sph.pairs import Pair, total
 
 SMOOTHING = 0.13
@@ -109,6 +113,27 @@ def test_viscosity_is_that_of_morris():
     expected = j["m"] * mu * (-r @ gradient) / (i["rho"] * j["rho"] * (r @ r)) * (i["v"] - j["v"])
     sides = ({key: jnp.asarray(value) for key, value in side.items()} for side in VALUES)
     np.testing.assert_allclose(viscosity.morris(make_pair(r), *sides, nu), expected, rtol=1e-7)
+
+
+def test_pressures_are_those_of_edac_with_a_transport_velocity():
+    """Ramachandran & Puri (2019) by NumPy: volumes 1/ΣW, and pressures less the mean over the particles that the kernel reaches."""
+    scene = fluids.fluid("taylor-green", nx=8, jitter=0.3, transport=100.0)
+    scene = replace(scene, physics=replace(scene.physics, viscosity=None), velocities=np.zeros((64, 2)))
+    p = np.random.default_rng(1).normal(1000.0, 1.0, 64)
+    model, s = make_model(scene, backend="brute"), make_state(scene)
+    a = jax.jit(solver.begin)(model, s._replace(p=jnp.asarray(p))).a
+    r = scene.positions[:, None] - scene.positions
+    r -= np.round(r)
+    distance, kernel, h = np.linalg.norm(r, axis=-1), KERNELS["quintic"], scene.physics.smoothing
+    m, near = scene.masses[0], distance < kernel.support * h
+    number = kernel.value(jnp.asarray(distance), h, 2).sum(axis=1)  # 1/V
+    gradient = np.asarray(kernel.slope(jnp.asarray(distance), h, 2))[..., None] * r / np.maximum(distance, 1e-9)[..., None]
+    rho, mean = m * np.asarray(number), (near @ p) / near.sum(axis=1)
+    between = rho[None] * (p - mean)[:, None] + rho[:, None] * (p[None] - mean[:, None])
+    between /= rho[:, None] + rho
+    volumes = (m / rho[:, None]) ** 2 + (m / rho) ** 2
+    expected = -np.sum((volumes * between)[..., None] * gradient, axis=1) / m
+    np.testing.assert_allclose(a, expected, rtol=1e-9, atol=1e-9 * np.abs(expected).max())
 
 
 @pytest.mark.parametrize("name", KERNELS)

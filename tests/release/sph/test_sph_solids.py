@@ -9,8 +9,9 @@ import pytest
 from matplotlib.path import Path as Outline
 from test_sph_commands import invoke, read_table
 
+from experiments.sph import answers, scenes
 from jfrnn.cases import fluids, meshes
-from jfrnn.sph import budget, health, solids, solver, view
+from jfrnn.sph import budget, force_on_solid, health, solids, solver, view
 from jfrnn.sph.errors import SceneError
 from jfrnn.sph.kernels import KERNELS
 from jfrnn.sph.model import make_model, make_state
@@ -173,6 +174,19 @@ def test_energy_and_momentum_beside_a_wall_that_stands():
     assert float(budget.momentum(model, s)[0]) == pytest.approx(along, rel=1e-9)  # the wall is smooth
     assert float(budget.momentum(model, s)[1]) > -0.5 * 3.0 * scene.masses.sum()  # it has stopped, or turned back
     assert np.asarray(s.x)[:, 1].min() > 0
+
+
+def test_the_torque_on_a_rotor():
+    """Of Couette's flow it is known, and converges with the particles; fluid that turns with the rotor does nothing to it."""
+    scene = scenes.rotor(16)
+    model, s, r = make_model(scene), make_state(scene), np.linalg.norm(scene.positions, axis=1)
+    rod, probe = (scenes.RATE, scenes.INNER, scenes.OUTER), jax.jit(force_on_solid())
+    torque = answers.rotor_torque(scenes.FRICTION, *rod)
+    for speed, known, off in ((answers.rotor(r, *rod), -torque, 0.05), (scenes.RATE * r, 0, 0.001)):
+        v = (speed / r)[:, None] * np.stack([-scene.positions[:, 1], scene.positions[:, 0]], axis=1)
+        found = probe(model, s._replace(v=jnp.asarray(v)))
+        assert found["torque"] == pytest.approx(known, abs=off * torque)
+        np.testing.assert_allclose(found["force"], 0, atol=1e-3 * torque)
 
 
 @pytest.mark.slow

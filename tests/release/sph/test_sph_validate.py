@@ -8,7 +8,7 @@ import pytest
 from typer.testing import CliRunner
 
 from experiments._cli import app
-from experiments.sph import answers, potential, validate
+from experiments.sph import answers, potential, validate, vortices
 from experiments.sph.validation import CASES, Case, Figure, Seen
 from jfrnn.cases import fluids
 
@@ -30,10 +30,24 @@ def test_interpolation_is_exact_for_planes_up_to_the_walls():
     np.testing.assert_allclose(answers.interpolate(x, x @ [2.0, 3.0] - 1, points, 0.2), points @ [2.0, 3.0] - 1, rtol=1e-12)
 
 
-@pytest.mark.parametrize("name", ["taylor-green", "poiseuille", "couette", "drop", "hydrostatic"])
-def test_what_is_exact_meets_its_targets_and_what_is_not_misses_them(name):
+def test_vortices_in_3d_begin_as_taylor_and_green_say():
+    """Compare with the series of Taylor & Green (1937), doi:10.1098/rspa.1937.0036, for the dissipation over 3/(4 Re)."""
+    t, e = np.array([0.0, 0.1, 0.2, 0.3]), 1 / 50
+    energies, rates = vortices.energies(t, 50.0, n=16)
+    series = 1 - 6 * e * t + (5 / 48 + 18 * e**2) * t**2 - (5 / 3 + 36 * e**2) * e * t**3
+    series += (50 / (99 * 64) + 1835 / (9 * 16) * e**2 + 54 * e**4) * t**4
+    np.testing.assert_allclose(rates, 0.75 * e * series, rtol=2e-5)
+    np.testing.assert_allclose(energies[::2], [1 / 8, 1 / 8 - 0.2 / 6 * (rates[0] + 4 * rates[1] + rates[2])], rtol=1e-8)
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["taylor-green", "taylor-green-3d-16", "poiseuille", "couette", "reverse-poiseuille-20", "rotor-10", "drop", "hydrostatic"],
+)
+def test_what_is_exact_meets_its_targets_and_what_is_not_misses_them(name, monkeypatch):
+    monkeypatch.setattr(vortices, "energies", lambda times, reynolds: (np.exp(-times / 10) / 8, np.exp(-times / 10) / 80))
     case = CASES[name]
-    scene = fluids.fluid(case.scene)
+    scene = case.scene(**case.settings) if callable(case.scene) else fluids.fluid(case.scene)
     x = scene.positions if scene.wall is None else scene.positions[~scene.wall]
     for factor, met in ((1.0, True), (1.1, False)):
         figures, _ = case.judge(scene, [exact(name, x, time, factor) for time in case.times])
@@ -71,12 +85,21 @@ def exact(name, x, time, factor):
     seen = Seen(time, x, np.zeros_like(x), np.zeros(len(x)), factor * 0.25 * np.exp(-16 * np.pi**2 * time / 100), 0.0)
     if name == "taylor-green":
         return seen._replace(v=factor * fluids_velocity(x, time))
+    if name == "taylor-green-3d-16":
+        return seen._replace(kinetic=factor * np.exp(-2 * np.pi * time / 10) / 8)
+    if name == "rotor-10":
+        around = answers.rotor(np.linalg.norm(x, axis=1), 2.0, 0.5, 1.0) / np.linalg.norm(x, axis=1)
+        return seen._replace(v=factor * around[:, None] * np.stack([-x[:, 1], x[:, 0]], axis=1), torque=-factor * 4 * np.pi / 15)
     if name == "drop":
         axis = factor * answers.drop_axis(np.array([time]))[0]
         return seen._replace(x=x * (1 / axis, axis))
     if name == "hydrostatic":
         return seen._replace(p=factor * 1000 * (0.9 - x[:, 1]))
-    along = {"poiseuille": answers.poiseuille, "couette": answers.couette}[name](x[:, 1], time)
+    if name == "reverse-poiseuille-20":
+        y, back = x[:, 1] % 0.5, np.sign(0.5 - x[:, 1] % 1)
+        along = back * answers.poiseuille(2 * y, time, 1.0, 0.05 * (np.pi / 0.5) ** 2)
+    else:
+        along = {"poiseuille": answers.poiseuille, "couette": answers.couette}[name](x[:, 1], time)
     return seen._replace(v=np.stack([factor * along, 0 * along], axis=1))
 
 
