@@ -57,6 +57,9 @@ constexpr bool DECIDED = true;    // which of its slots hold a pair
 constexpr bool MIRRORED = false;  // a term reads of i what it reads of j
 constexpr bool MEASURED = false;  // distances are written, too
 constexpr bool BOXES = false;     // each system has a lattice of its own
+// Of lists that renew themselves (see jfrnn/kernels/renew.py): bits of a status, and where the order of sources stands in a scratch.
+constexpr int BIT_NOT_FINITE = 2, BIT_OUT_OF_RANGE = 8, BIT_BOX_TOO_SMALL = 4;
+constexpr int FIRST_PLACE = 2624, PLACE_WORDS = 4, PLACE_WORD = 3;
 // Of triangles (see jfrnn/kernels/_triangles.py, triangles_cpu.py and triangles_cuda.py).
 constexpr int LIMBS = 14, ROOM = 1202, STRIDE = 1;
 constexpr int MOST_CELLS = 8, MOST_ALONG = 64, MOST_ALONG_LOG2 = 6;
