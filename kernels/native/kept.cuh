@@ -28,14 +28,18 @@ struct KeptLane : Kept {
     // Reads what belongs to the slots of a row from `place` on: at once, where rows begin at multiples of 16 bytes.
     template <class Element>
     JFRNN_MEMBER void read_slots(const Element* row, int place, Element* to) const {
-        struct alignas(sizeof(Element) * AT_A_TIME) Words {
-            Element at[AT_A_TIME];
-        } words;
-        if constexpr (ALIGNED)
-            load_words((const Words*)(row + place), &words);
+        if constexpr (ALIGNED) {
+            constexpr int TOGETHER = AT_A_TIME * sizeof(Element) > 16 ? 16 / sizeof(Element) : AT_A_TIME;
+            struct alignas(sizeof(Element) * TOGETHER) Words {
+                Element at[TOGETHER];
+            };
 #pragma unroll
-        for (int k = 0; k < AT_A_TIME; ++k)
-            to[k] = ALIGNED ? words.at[k] : place + k < capacity ? row[place + k] : Element(0);
+            for (int part = 0; part < AT_A_TIME; part += TOGETHER)
+                load_words((const Words*)(row + place + part), (Words*)(to + part));
+        } else
+#pragma unroll
+            for (int k = 0; k < AT_A_TIME; ++k)
+                to[k] = place + k < capacity ? row[place + k] : Element(0);
     }
     // Reads the entries from `place` on: at once, where rows begin at multiples of 16 bytes.
     JFRNN_MEMBER void read(long long first, int place, int all, Entries& some) const {

@@ -7,6 +7,7 @@
 // registers, and every pair waits for its own.
 template <class Words>
 JFRNN_FUNCTION void load_words(const void* from, Words* to) {
+    static_assert(sizeof(Words) == 4 || sizeof(Words) == 8 || sizeof(Words) == 16, "what is loaded at once");
     unsigned int w[4];
     const size_t at = __cvta_generic_to_global(from);
     if constexpr (sizeof(Words) == 16)
