@@ -30,6 +30,7 @@ RANGES: dict[str, Bounds] = {
     "teeth": {"ge": 5, "le": 1000},
     "faces": {"ge": 100, "le": 10_000_000},
     "jitter": {"ge": 0, "le": 0.5},
+    "cfl": {"gt": 0, "le": 1},
     "restitution": {"ge": 0, "le": 1},
     "tank": {"ge": 1, "le": 1000},
     "spacing": {"ge": 0.002, "le": 1},

@@ -13,7 +13,7 @@ from jax import Array
 
 import jfrnn
 from jfrnn.cases.fluids import GasScene, Scene
-from jfrnn.sph import health, settings, snapshots, solids, solver
+from jfrnn.sph import health, series, settings, snapshots, solids, solver
 from jfrnn.sph.errors import SceneError
 from jfrnn.sph.interrupts import hold_interrupts
 from jfrnn.sph.model import choose_dtype, make_model, make_state
@@ -34,6 +34,7 @@ class How:
         skin: Of the list, in particle spacings.
         pictures: Whether frames and a GIF are drawn.
         lines: Lines of the tables, energies.csv and probes.csv, for each snapshot.
+        hdf: Whether all snapshots also go into one file, NAME.vtkhdf; takes h5py.
     """
 
     frames: int = 50
@@ -42,6 +43,7 @@ class How:
     skin: float = 0.3
     pictures: bool = True
     lines: int = 1
+    hdf: bool = False
 
 
 SECONDS, MOST_STEPS = 0.5, 100_000  # between two looks at a run
@@ -73,7 +75,7 @@ def run(
     Args:
         scene: The scene.
         folder: Gets run.json, energies.csv, probes.csv, snapshots/STEP.npz and .vtp, NAME.pvd, the series of those for ParaView,
-            frames/STEP.png, NAME.gif.
+            frames/STEP.png, NAME.gif; and, if asked for, NAME.vtkhdf.
         how: Options.
         force: As in `make_model`. It is no part of run.json: who goes on with a run gives the same.
         probes: Functions (model, state) -> numbers, arrays or dicts of them, inside jit, whose values are columns of probes.csv.
@@ -87,6 +89,8 @@ def run(
         KeyboardInterrupt: Ctrl-C came.
     """
     folder, dtype = Path(folder), choose_dtype(how.dtype)
+    if how.hdf:
+        series.check_library()
     with hold_interrupts() as stopped:
         try:
             model, first = make_model(scene, dtype, force=force), make_state(scene, dtype)  # what is refused leaves no folder
@@ -101,6 +105,7 @@ def run(
             s = jax.jit(solver.begin)(model, s, nbrs)
             write.line(s, step)
             write.snapshot(s, nbrs, step)
+        write.series(step)
         moments = how.frames * how.lines
         progress = Progress(how.frames, round(how.frames * float(s.time) / scene.duration))
         start, step_before = perf_counter(), step
@@ -229,3 +234,9 @@ class _Writer:
             frames.draw(scene, there, x, v, time, float(top), self._folder / "frames" / f"{step:09d}.png")
         snapshots.save(s, scene, np.asarray(rho), np.asarray(p), self._folder / "snapshots", step)
         snapshots.add_to_series(self._folder / f"{scene.name}.pvd", float(s.time), step)
+        self.series(step)
+
+    def series(self, step: int) -> None:
+        """Bring the one file of all snapshots up to this step, where it is asked for."""
+        if self._how.hdf:
+            series.follow(self._folder / f"{self._scene.name}.vtkhdf", self._folder / "snapshots", step)

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -174,6 +175,8 @@ def test_the_courant_step_follows_the_scene():
     model, s = begun(scene)
     h, c = scene.physics.smoothing, scene.physics.sound_speed
     assert solver.courant(model, s) == pytest.approx(min(0.25 * h / c, 0.25 * np.sqrt(h / 9.81)), rel=0.3)
+    slow = replace(model, physics=replace(model.physics, cfl=jnp.asarray(0.1)))
+    assert solver.courant(slow, s) == pytest.approx(0.4 * solver.courant(model, s))
     later, _ = solver.advance(model, s, None, 20)
     assert later.last < 0.25 * h / c
     with pytest.raises(ValueError, match="multiple of segments"):
