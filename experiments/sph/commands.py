@@ -51,3 +51,16 @@ def gradients(
 
     check_names("problem", names, gradients.NAMES)
     return gradients.run(names or [], take_folder(out), evaluations)
+
+
+def start(
+    resolutions: Annotated[list[int] | None, typer.Argument(min=8, help="Particles along each axis; 25 and 50 without.")] = None,
+    out: Annotated[Path, typer.Option(help="Folder of the table.")] = Path("out") / "sph-start",
+) -> str:
+    """Run decaying vortices from a lattice, from displaced and from relaxed particles, or go on with it; then print a table."""
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    from experiments.sph import start
+
+    return start.run(tuple(resolutions or (25, 50)), take_folder(out))

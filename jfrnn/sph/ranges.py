@@ -6,6 +6,10 @@ from typing import Annotated, Any, Union, get_args, get_origin
 from pydantic import Field, TypeAdapter, ValidationError
 
 Bounds = dict[str, float]
+MANY: Bounds = {"ge": 1, "le": 1_000_000}
+"""Of snapshots, and of lines for each."""
+SKIN: Bounds = {"ge": 0.01, "le": 100}
+"""Of a list, in particle spacings."""
 
 _ABOVE_0: Bounds = {"gt": 0}
 _FROM_0: Bounds = {"ge": 0}

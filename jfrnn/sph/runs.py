@@ -5,7 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import numpy as np
@@ -13,7 +13,7 @@ from jax import Array
 
 import jfrnn
 from jfrnn.cases.fluids import GasScene, Scene
-from jfrnn.sph import health, series, settings, snapshots, solids, solver
+from jfrnn.sph import health, ranges, series, settings, snapshots, solids, solver
 from jfrnn.sph.errors import SceneError
 from jfrnn.sph.interrupts import hold_interrupts
 from jfrnn.sph.model import choose_dtype, make_model, make_state
@@ -44,6 +44,20 @@ class How:
     pictures: bool = True
     lines: int = 1
     hdf: bool = False
+
+    def __post_init__(self) -> None:
+        """Refuse what the command line would.
+
+        Raises:
+            SceneError: Names the field.
+        """
+        kinds = {"frames": int, "lines": int, "skin": float, "neighbors": Literal["auto", "pair_sum", "list"]}
+        bounds = {"frames": ranges.MANY, "lines": ranges.MANY, "skin": ranges.SKIN}
+        for name, kind in kinds.items():
+            try:
+                ranges.read(kind, value := getattr(self, name), bounds.get(name))
+            except ValueError as error:
+                raise SceneError(f"{name}: got {value!r}; {error}") from error
 
 
 SECONDS, MOST_STEPS = 0.5, 100_000  # between two looks at a run
@@ -166,7 +180,10 @@ def _first_neighbors(scene: Scene, model: Flow, s: State, how: How) -> Neighbors
     way = faster_way(jax.default_backend(), scene.n) if how.neighbors == "auto" else how.neighbors
     nbrs = solver.list_neighbors(model, s, how.skin * scene.spacing) if way == "list" else None
     if how.neighbors == "list" and nbrs is None:
-        raise SceneError(f"neighbors 'list': which pairs scene {scene.name!r} has changes in every step; take pair_sum or auto")
+        thin = " beside its thin solid (thin=False of the solid leaves that out)" if scene.solid else ""
+        raise SceneError(
+            f"neighbors 'list': which pairs scene {scene.name!r} has{thin} changes in every step; take pair_sum or auto"
+        )
     return nbrs
 
 

@@ -23,7 +23,9 @@ def check_library() -> None:
     try:
         import h5py  # noqa: F401
     except ImportError as error:
-        raise SceneError("hdf: a file .vtkhdf is written by h5py, which is not installed: pip install h5py, or leave hdf out") from error
+        raise SceneError(
+            "hdf: a file .vtkhdf is written by h5py, which is not installed: pip install h5py, or leave hdf out"
+        ) from error
 
 
 def follow(path: Path, snapshots: Path, step: int) -> None:

@@ -9,10 +9,12 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from jfrnn.cases.fluids import FluidScene, Periodic, Physics, Solid, Tank, Turning, inflow, lattice
+from jfrnn.sph import ranges
 from jfrnn.sph.check import check_physics, check_scene
 from jfrnn.sph.errors import SceneError
 from jfrnn.sph.files import read_solid
 from jfrnn.sph.kernels import KERNELS
+from jfrnn.sph.relaxing import relax
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Place = list[Annotated[float, Field(allow_inf_nan=False)]]
@@ -78,8 +80,8 @@ class Output(_Table):
     """What a run writes: a snapshot each so many seconds, or so many of them; the rest as in `How`."""
 
     interval: Positive | None = None
-    frames: Annotated[int, Field(ge=1, le=1_000_000)] | None = None
-    lines: Annotated[int, Field(ge=1, le=1_000_000)] = 1
+    frames: Annotated[int, Field(**ranges.MANY)] | None = None  # pyright: ignore[reportArgumentType]
+    lines: Annotated[int, Field(**ranges.MANY)] = 1  # pyright: ignore[reportArgumentType]
     pictures: bool = True
     hdf: bool = False
 
@@ -98,6 +100,7 @@ class Own(_Table):
     bounds: Corners | None = None
     solid: SolidFile | None = None
     output: Output = Output()
+    relax: bool = False
     physics: dict[str, Any]
 
 
@@ -112,6 +115,7 @@ def read_scene(path: Path | str) -> FluidScene:
     try:
         scene = _make(given, path)
         check_scene(scene)
+        scene = relax(scene) if given.relax else scene
     except SceneError as error:
         raise SceneError(f"{path}: {error}") from error
     return scene

@@ -179,6 +179,20 @@ def test_all_snapshots_go_into_one_file_that_paraview_reads(tmp_path, monkeypatc
 
 
 @pytest.mark.parametrize(
+    ("told", "message"),
+    [
+        ({"frames": 0}, r"frames: got 0; input should be greater than or equal to 1 \(from 1 to 1 000 000\)"),
+        ({"frames": "few"}, "frames: got 'few'; input should be a valid integer"),
+        ({"skin": -1.0}, "skin: got -1.0; input should be greater than or equal to 0.01"),
+        ({"neighbors": "verlet"}, "neighbors: got 'verlet'; input should be 'auto', 'pair_sum' or 'list'"),
+    ],
+)
+def test_a_mistake_in_how_a_scene_is_run_is_named(told, message):
+    with pytest.raises(SceneError, match=message):
+        sph.How(**told)
+
+
+@pytest.mark.parametrize(
     ("more", "message"),
     [
         ("interval = 0.004", "output.interval: a duration of 0.01 s is no whole number of 0.004 s"),

@@ -74,7 +74,7 @@ def test_water_does_not_feel_water_through_a_sheet():
     )
     model, s = sph.make_model(between_blocks(0.5 * DX, None)), sph.make_state(between_blocks(0.5 * DX, None))
     assert sph.list_neighbors(model, s, 0.01) is None
-    with pytest.raises(sph.SceneError, match="nbrs must be None beside a thin solid"):
+    with pytest.raises(sph.SceneError, match=r"nbrs must be None beside a thin solid.*Leave it out, so that sums search"):
         sph.begin(model, s, jfrnn.NeighborList)
     change, slope, sight = felt(0.5, False)
     assert change > 0.1
