@@ -64,3 +64,10 @@ def start(
     from experiments.sph import start
 
     return start.run(tuple(resolutions or (25, 50)), take_folder(out))
+
+
+def peers(out: Annotated[Path, typer.Option(help="Folder of the table.")] = Path("out") / "sph-peers") -> str:
+    """Time steps of solvers that others released and that are installed here, or go on with it; then print a table."""
+    from experiments.sph import peers
+
+    return peers.run(take_folder(out))

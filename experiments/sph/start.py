@@ -1,4 +1,4 @@
-"""What a start costs a flow: the kinetic energy that vortices keep, over the exact one, from a lattice and from relaxed particles."""
+"""What a start costs a flow: the kinetic energy that vortices keep from a lattice, and from relaxed particles."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +13,7 @@ from jfrnn.cases.fluids import FluidScene
 
 JAX_SPH: dict[str, Any] = {"evolve": "summation", "state": "linear", "integrator": "leapfrog", "pressure_diffusion": None}
 """What of jax-sph's defaults with its transport velocity differs from `--set transport=100`: densities are summed, pressures are
-c²(ρ-ρ0), and steps are those of its semi-implicit Euler scheme."""
+those of the linear equation of state, and steps are those of its semi-implicit Euler scheme."""
 SCHEMES: dict[str, dict[str, Any]] = {"EDAC, transport": {}, "jax-sph's": JAX_SPH}
 STARTS = ("lattice", "off by 0.2 spacings", "relaxed")
 _REYNOLDS, _END = 100.0, 2.0

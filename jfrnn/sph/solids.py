@@ -29,7 +29,7 @@ from jfrnn.sph.pairs import reach
 from jfrnn.sph.particles import Beside, Model, State, active
 
 GAP = 0.2  # particle spacings: on a lattice, particles at a wall are half a spacing away
-_ROOM_AROUND = 4  # times the particles that are near a point in a fluid on a lattice: a fluid that falls on a wall is denser
+_ROOM_AROUND = 2  # times the particles that are near a point in a fluid on a lattice
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
 _PLACES, _SHARES = (_NODES + 1) / 2, _WEIGHTS / 2
 
