@@ -138,7 +138,7 @@ def _warp() -> Row:
         smoothing_length = property(lambda self: size, lambda self, value: None)
 
     with warp.ScopedDevice("cuda:0" if warp.is_cuda_available() else "cpu") as device:
-        example = Sized(stage_path=None)
+        example = Sized(stage_path=None)  # pyright: ignore[reportArgumentType]
         for _ in range(_FALLING):
             example.step()
         warp.synchronize()

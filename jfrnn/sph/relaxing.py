@@ -95,7 +95,11 @@ def _spread(scene: FluidScene, x: Array, free: Array, enough: float, steps: int)
         return _Moved(now.x + step, step, jnp.max(jnp.linalg.norm(crowding, axis=1)), now.steps + 1)
 
     first = _Moved(x, jnp.zeros_like(x), jnp.asarray(jnp.inf, x.dtype), jnp.zeros((), jnp.int32))
-    return jax.jit(partial(jax.lax.while_loop, lambda now: (now.worst > enough) & (now.steps < steps), move))(first)
+
+    def goes_on(now: _Moved) -> Array:
+        return (now.worst > enough) & (now.steps < steps)
+
+    return jax.jit(partial(jax.lax.while_loop, goes_on, move))(first)
 
 
 def _carry(scene: FluidScene, x: Array, by: Array, free: Array, fields: dict[str, Array]) -> dict[str, Array]:

@@ -54,8 +54,9 @@ class How:
         kinds = {"frames": int, "lines": int, "skin": float, "neighbors": Literal["auto", "pair_sum", "list"]}
         bounds = {"frames": ranges.MANY, "lines": ranges.MANY, "skin": ranges.SKIN}
         for name, kind in kinds.items():
+            value = getattr(self, name)
             try:
-                ranges.read(kind, value := getattr(self, name), bounds.get(name))
+                ranges.read(kind, value, bounds.get(name))
             except ValueError as error:
                 raise SceneError(f"{name}: got {value!r}; {error}") from error
 

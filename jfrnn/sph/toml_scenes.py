@@ -17,6 +17,7 @@ from jfrnn.sph.kernels import KERNELS
 from jfrnn.sph.relaxing import relax
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Many = Annotated[int, Field(ge=ranges.MANY["ge"], le=ranges.MANY["le"])]
 Place = list[Annotated[float, Field(allow_inf_nan=False)]]
 
 
@@ -80,8 +81,8 @@ class Output(_Table):
     """What a run writes: a snapshot each so many seconds, or so many of them; the rest as in `How`."""
 
     interval: Positive | None = None
-    frames: Annotated[int, Field(**ranges.MANY)] | None = None  # pyright: ignore[reportArgumentType]
-    lines: Annotated[int, Field(**ranges.MANY)] = 1  # pyright: ignore[reportArgumentType]
+    frames: Many | None = None
+    lines: Many = 1
     pictures: bool = True
     hdf: bool = False
 
