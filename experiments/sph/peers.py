@@ -22,8 +22,8 @@ CONTENT = {
     "jfrnn.sph": "three sums: densities carried on with δ-SPH's diffusion, what walls show, pressure and artificial viscosity; "
     "a symplectic step as long as the Courant condition allows",
     "jfrnn.sph, cutoff of 2 spacings": "the same",
-    "SPlisHSPlasH, WCSPH": "neighbors by CompactNSearch, densities summed, Tait's pressure, its force, XSPH viscosity, walls as "
-    "particles with volumes (Akinci et al. 2012), a semi-implicit Euler step of 0.1 ms; float32, OpenMP",
+    "SPlisHSPlasH, WCSPH": "neighbors by CompactNSearch, densities summed, Tait's pressure, its force, explicit viscosity, walls "
+    "as particles with volumes (Akinci et al. 2012), a semi-implicit Euler step of 0.1 ms; float32, OpenMP",
     "Warp, example_sph": "HashGrid built, densities summed, pressure and viscosity (Müller et al. 2003), six planes that particles "
     "bounce off, kick and drift; float32",
 }
