@@ -67,6 +67,21 @@ def peers() -> str:
     return markdown(heads, lines)
 
 
+def thin() -> str:
+    """Return steps per second beside a thin wall, with and without lines of sight."""
+    rows = read("sph_thin/table.csv")
+    lines = [
+        [row["device"], whole(row["particles"]), whole(row["parted pairs"]), _rate(row["through"]), _rate(row["sight"])]
+        for row in rows
+    ]
+    heads = ("", ">particles", ">pairs parted", ">steps/s, water feels water through it", ">steps/s, it does not")
+    return markdown(heads, lines)
+
+
+def _rate(text: str) -> str:
+    return number(text) or "to be measured"
+
+
 def starts() -> str:
     """Return the kinetic energy that vortices keep by the start, over the exact one."""
     rows, lines = read("sph_start/table.csv"), []
@@ -96,4 +111,5 @@ TABLES = {
     "sph-kept": kept,
     "sph-peers": peers,
     "sph-starts": starts,
+    "sph-thin": thin,
 }

@@ -71,3 +71,13 @@ def peers(out: Annotated[Path, typer.Option(help="Folder of the table.")] = Path
     from experiments.sph import peers
 
     return peers.run(take_folder(out))
+
+
+def thin(
+    sizes: Annotated[list[int] | None, typer.Argument(min=4, help="Particles along a block; 16 and 32 without.")] = None,
+    out: Annotated[Path, typer.Option(help="Folder of the table.")] = Path("out") / "sph-thin",
+) -> str:
+    """Time steps beside a thin wall, with lines of sight and without; then print a table."""
+    from experiments.sph import thin
+
+    return thin.run(tuple(sizes or (16, 32)), take_folder(out))
