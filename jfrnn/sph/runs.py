@@ -56,7 +56,7 @@ class How:
         for name, kind in kinds.items():
             value = getattr(self, name)
             try:
-                ranges.read(kind, value, bounds.get(name))
+                object.__setattr__(self, name, ranges.read(kind, value, bounds.get(name)))  # frozen; the text "2" is 2
             except ValueError as error:
                 raise SceneError(f"{name}: got {value!r}; {error}") from error
 
