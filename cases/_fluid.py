@@ -47,6 +47,7 @@ class Physics(Generic[Number, Vector]):
         tears: The fluid gives way where it is stretched: a density that is carried along does not fall below that at rest. Without
             it, a jet that breaks up pulls its particles together in pairs and clumps.
         integrator: "leapfrog" (kick, drift), "symplectic" (kick, drift, kick), or "midpoint" (Runge-Kutta of second order).
+        cfl: Courant number of a scene without a step: its steps are cfl h/(c + |v|) or, by viscosity and accelerations, shorter.
     """
 
     density: Number
@@ -74,6 +75,7 @@ class Physics(Generic[Number, Vector]):
     slip: bool = False
     tears: bool = False
     integrator: Literal["leapfrog", "symplectic", "midpoint"] = "symplectic"
+    cfl: Number = 0.25  # pyright: ignore[reportAssignmentType] - a scene's; a solver gives all numbers
 
 
 WORDS = (

@@ -59,6 +59,9 @@ class Sph(_commands.Commands):
             "validate": "Run fluid scenes with known answers.",
             "speed": "Time steps of a fluid scene.",
             "gradients": "Solve inverse problems by gradients.",
+            "peers": "Time steps of solvers that others released.",
+            "thin": "Time steps beside a thin wall.",
+            "start": "Run vortices from a lattice and from relaxed particles.",
         }.items()
     }
 

@@ -54,6 +54,43 @@ def ways() -> str:
     return markdown(("way", ">steps/s", ">`pair_sum` is faster", ">MB"), lines)
 
 
+def peers() -> str:
+    """Return steps per second of released solvers, with what a step computes; nothing where none was measured."""
+    lines = []
+    for row in read("sph_peers/table.csv"):
+        rate = number(1 / float(row["seconds"])) if row["seconds"] else row["reason"]
+        who = f"{row['solver']} {row['version']}"
+        lines.append(
+            [who, row["device"], whole(row["fluid"]), whole(row["walls"]), number(row["neighbors"]), rate, row["computes"]]
+        )
+    heads = ("solver", "on", ">particles of the fluid", ">of walls", ">neighbors", ">steps/s", "what a step computes")
+    return markdown(heads, lines)
+
+
+def thin() -> str:
+    """Return steps per second beside a thin wall, with and without lines of sight."""
+    rows = read("sph_thin/table.csv")
+    lines = [
+        [row["device"], whole(row["particles"]), whole(row["parted pairs"]), _rate(row["through"]), _rate(row["sight"])]
+        for row in rows
+    ]
+    heads = ("", ">particles", ">pairs parted", ">steps/s, water feels water through it", ">steps/s, it does not")
+    return markdown(heads, lines)
+
+
+def _rate(text: str) -> str:
+    return number(text) or "to be measured"
+
+
+def starts() -> str:
+    """Return the kinetic energy that vortices keep by the start, over the exact one."""
+    rows, lines = read("sph_start/table.csv"), []
+    for about in dict.fromkeys((row["scheme"], row["nx"]) for row in rows):
+        found = [row for row in rows if (row["scheme"], row["nx"]) == about]
+        lines.append([about[0], f"{about[1]}²", *(number(row["kept"]) for row in found)])
+    return markdown(("scheme", ">particles", *(f">{row['start']}" for row in rows[:3])), lines)
+
+
 def kept() -> str:
     """Return steps per second of sums that search, and of those over a list with a skin."""
     lines = []
@@ -72,4 +109,7 @@ TABLES = {
     "sph-memory": reverse_memory,
     "sph-ways": ways,
     "sph-kept": kept,
+    "sph-peers": peers,
+    "sph-starts": starts,
+    "sph-thin": thin,
 }

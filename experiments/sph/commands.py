@@ -51,3 +51,33 @@ def gradients(
 
     check_names("problem", names, gradients.NAMES)
     return gradients.run(names or [], take_folder(out), evaluations)
+
+
+def start(
+    resolutions: Annotated[list[int] | None, typer.Argument(min=8, help="Particles along each axis; 25 and 50 without.")] = None,
+    out: Annotated[Path, typer.Option(help="Folder of the table.")] = Path("out") / "sph-start",
+) -> str:
+    """Run decaying vortices from a lattice, from displaced and from relaxed particles, or go on with it; then print a table."""
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    from experiments.sph import start
+
+    return start.run(tuple(resolutions or (25, 50)), take_folder(out))
+
+
+def peers(out: Annotated[Path, typer.Option(help="Folder of the table.")] = Path("out") / "sph-peers") -> str:
+    """Time steps of solvers that others released and that are installed here, or go on with it; then print a table."""
+    from experiments.sph import peers
+
+    return peers.run(take_folder(out))
+
+
+def thin(
+    sizes: Annotated[list[int] | None, typer.Argument(min=4, help="Particles along a block; 16 and 32 without.")] = None,
+    out: Annotated[Path, typer.Option(help="Folder of the table.")] = Path("out") / "sph-thin",
+) -> str:
+    """Time steps beside a thin wall, with lines of sight and without; then print a table."""
+    from experiments.sph import thin
+
+    return thin.run(tuple(sizes or (16, 32)), take_folder(out))

@@ -12,6 +12,7 @@ from jfrnn.sph.files import read_solid, with_particles, with_solid
 from jfrnn.sph.model import make_model, make_state
 from jfrnn.sph.particles import Model, State
 from jfrnn.sph.probes import flow_through, force_on_solid, force_on_walls, pressure_at, surface_height
+from jfrnn.sph.relaxing import relax
 from jfrnn.sph.runs import How, run
 from jfrnn.sph.settings import make_scene
 from jfrnn.sph.solver import (
@@ -61,6 +62,7 @@ __all__ = [
     "pressure_at",
     "read_scene",
     "read_solid",
+    "relax",
     "rollout",
     "run",
     "step",

@@ -31,6 +31,7 @@ def check_scene(scene: Scene) -> None:
     """
     if not isinstance(scene, FluidScene | GasScene):
         raise SceneError(f"scene must be a FluidScene or a GasScene, got {_kind(scene)}.")
+    _check_kinds(scene)
     _check_particles(scene)
     for name in ("spacing", "duration"):
         _check_number(name, getattr(scene, name))
@@ -49,6 +50,20 @@ def check_scene(scene: Scene) -> None:
     check_physics(scene.physics)
     if isinstance(scene, FluidScene):
         _check_fluid(scene)
+
+
+def _check_kinds(scene: FluidScene | GasScene) -> None:
+    """Refuse fields that are of another kind than they should be, such as a pair of corners instead of a `Tank`."""
+    if not isinstance(scene.name, str) or not scene.name or "/" in scene.name:
+        raise SceneError(f"name must be a text without '/', which files are called by, got {_kind(scene.name)}.")
+    kinds: dict[str, type] = {"tank": fluids.Tank, "bounds": fluids.Tank, "sealed": fluids.Tank, "outflow": fluids.Tank}
+    for name, kind in (kinds | {"periodic": fluids.Periodic, "solid": fluids.Solid}).items():
+        value = getattr(scene, name)
+        if value is not None and not isinstance(value, kind):
+            raise SceneError(f"{name} must be a {kind.__name__} or None, got {_kind(value)}.")
+    kind = fluids.Physics if isinstance(scene, FluidScene) else fluids.Gas
+    if not isinstance(scene.physics, kind):
+        raise SceneError(f"physics must be a {kind.__name__}, got {_kind(scene.physics)}.")
 
 
 def _kind(value: object) -> str:
@@ -117,8 +132,9 @@ def _check_steps(scene: Scene) -> None:
 
 def _check_corners(name: str, lower: Sequence[float], upper: Sequence[float], dim: int) -> None:
     for part, corner in (("lower", lower), ("lengths" if name == "periodic" else "upper", upper)):
-        if len(corner) != dim or any(np.isnan(corner)):
-            raise SceneError(f"{name}.{part} must have a number for each of {dim} axes, got {len(corner)}: {tuple(corner)!r}.")
+        numbers = np.asarray(corner)
+        if numbers.shape != (dim,) or numbers.dtype.kind not in "fiu" or np.isnan(numbers).any():
+            raise SceneError(f"{name}.{part} must have a number for each of {dim} axes, got {_kind(corner)}.")
     if not all(low < high for low, high in zip(lower, upper, strict=True)):
         raise SceneError(f"{name} must reach from a lower to an upper corner, got {tuple(lower)!r} and {tuple(upper)!r}.")
 
@@ -130,6 +146,8 @@ def _check_solid(solid: fluids.Solid, dim: int) -> None:
         raise SceneError("solid.vertices are not finite.")
     if faces.dtype.kind == "f" or (faces.size and not 0 <= faces.min() <= faces.max() < len(vertices)):
         raise SceneError(f"solid.faces must be whole numbers from 0 to {len(vertices) - 1}, numbers of vertices.")
+    if not isinstance(solid.thin, bool | None):
+        raise SceneError(f"solid.thin must be True, False or None, got {_kind(solid.thin)}.")
     if (turning := solid.turning) is not None:
         wanted = {"center": turning.center, "axis": turning.axis} if dim == len("xyz") else {"center": turning.center}
         for name, vector in wanted.items():
@@ -158,6 +176,8 @@ def check_physics(physics: Any) -> None:  # noqa: ANN401
 def _check_fluid(scene: FluidScene) -> None:
     """Refuse physics that does not go with where the particles are."""
     physics, smoothing = scene.physics, float(scene.physics.smoothing) / scene.spacing
+    if scene.guided != 0:
+        _check_number("guided", scene.guided)
     if physics.gravity is not None and len(physics.gravity) != scene.dim:
         raise SceneError(f"gravity has {len(physics.gravity)} components, expected {scene.dim} in {scene.dim}D")
     if not LEAST_SMOOTHING <= smoothing <= MOST_SMOOTHING:

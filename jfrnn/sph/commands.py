@@ -3,6 +3,7 @@
 import argparse
 import sys
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -10,6 +11,7 @@ import jax
 
 from jfrnn.sph import files, listing, ranges, runs, settings, toml_scenes
 from jfrnn.sph.errors import DivergedError, SceneError
+from jfrnn.sph.relaxing import relax
 
 
 class _Parser(argparse.ArgumentParser):
@@ -56,16 +58,20 @@ def _make_parser() -> _Parser:
     run.add_argument("--out", type=Path, help="folder of the run; out/sph/SCENE without it")
     run.add_argument("--initial", type=Path, metavar="FILE", help="initial particles instead of the scene's: .npz or .csv")
     run.add_argument("--solid", type=Path, metavar="FILE", help="a closed wall instead of the scene's, in 3D: STL, OBJ or PLY")
+    relax = "begin with particles that a constant pressure has spread evenly, instead of a lattice"
+    run.add_argument("--relax", action="store_true", help=relax)
     unit = "unit of that file [m]: 0.001 for mm; 1 without"
     run.add_argument("--solid-unit", type=_number(float, ge=1e-9, le=1e3), metavar="M", help=unit)
-    run.add_argument("--frames", type=_number(int, ge=1, le=1_000_000), default=50, metavar="N", help="snapshots after the first")
+    run.add_argument("--frames", type=_number(int, **ranges.MANY), metavar="N", help="snapshots after the first: 50")
     run.add_argument("--dtype", type=_word("float32", "float64"), default="float64", help="float32 or float64")
     ways = "pair_sum; list: a list with a skin; auto: what is faster here"
     run.add_argument("--neighbors", type=_word("auto", "pair_sum", "list"), default="auto", help=ways)
     skin = "of the list, in particle spacings"
-    run.add_argument("--skin", type=_number(float, ge=0.01, le=100), default=0.3, metavar="SPACINGS", help=skin)
+    run.add_argument("--skin", type=_number(float, **ranges.SKIN), default=0.3, metavar="SPACINGS", help=skin)
     pictures = "whether frames and a GIF are drawn"
-    run.add_argument("--pictures", action=argparse.BooleanOptionalAction, default=True, help=pictures)
+    run.add_argument("--pictures", action=argparse.BooleanOptionalAction, default=None, help=pictures)
+    hdf = "whether all snapshots also go into one file, SCENE.vtkhdf"
+    run.add_argument("--hdf", action=argparse.BooleanOptionalAction, default=None, help=hdf)
     what = "say what scenes there are, or what a scene can be told, with units and ranges"
     names = add("list", help=what, description=what, allow_abbrev=False)
     names.set_defaults(act=lambda given: listing.names() if given.scene is None else listing.scene(given.scene))
@@ -100,14 +106,18 @@ def _run(given: argparse.Namespace) -> str:
     if given.solid is None and given.solid_unit is not None:
         raise SceneError(f"--solid-unit {given.solid_unit:g}: is the unit of the file of --solid; name that file too")
     jax.config.update("jax_enable_x64", given.dtype == "float64")
+    how = runs.How(dtype=given.dtype, neighbors=given.neighbors, skin=given.skin)
     if given.scene.endswith(".toml"):
         if given.settings:
             raise SceneError(f"--set {given.settings[0]}: {given.scene} says all of its scene; change it there")
         scene = toml_scenes.read_scene(given.scene)
+        how = replace(how, **toml_scenes.read_output(given.scene))
     else:
         scene = settings.make_scene(given.scene, given.settings)
     scene = scene if given.initial is None else files.with_particles(scene, given.initial)
+    scene = relax(scene) if given.relax else scene
     scene = scene if given.solid is None else files.with_solid(scene, given.solid, given.solid_unit or 1.0)
     folder = given.out or Path("out") / "sph" / scene.name
-    runs.run(scene, folder, runs.How(given.frames, given.dtype, given.neighbors, given.skin, given.pictures))
+    told = {name: getattr(given, name) for name in ("frames", "pictures", "hdf") if getattr(given, name) is not None}
+    runs.run(scene, folder, replace(how, **told))
     return str(folder)

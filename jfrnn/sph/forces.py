@@ -57,7 +57,9 @@ def _sum(term: Term, model: Model, s: State, values: Values, nbrs: Neighbors, of
     if s.solid is not None and s.solid.sight is not None:
         if nbrs is not None:
             raise SceneError(
-                "nbrs must be None beside a thin solid: which pairs it parts changes in every step, and a list keeps them."
+                "nbrs must be None beside a thin solid: which pairs it parts changes in every step, and a list keeps its pairs. "
+                "Leave it out, so that sums search, as where `list_neighbors` returns None; or take Solid(thin=False), if water "
+                "may feel water through it."
             )
         options["exclude"] = s.solid.sight.parted
     if k is None or nbrs is not None or of == "all" or "exclude" in options:

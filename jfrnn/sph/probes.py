@@ -20,6 +20,8 @@ Probe = Callable[[Any, State], Any]
 def pressure_at(points: Any) -> Probe:  # noqa: ANN401
     """Return a probe of the pressures of a fluid [Pa], shape [k], at points [m], shape [k, d]; 0 where no fluid is near.
 
+    Beside a thin solid, fluid behind it does not count. NaN: more particles were near the points than there was room for.
+
     Source: Shepard (1968), doi:10.1145/800186.810616: the mean over the fluid, weighed by volumes times the kernel.
     """
 
@@ -35,9 +37,12 @@ def pressure_at(points: Any) -> Probe:  # noqa: ANN401
             return {"weight": weight, "p": weight * j["p"]}
 
         options = {"box": model.box, "active": active(model, s), "queries": at, "query_values": {"p": jnp.zeros_like(at[:, 0])}}
+        known: Any = True
+        if s.solid is not None and s.solid.sight is not None:
+            options["exclude"], known = solids.hidden(model, s, s.solid, at)
         sums = total(term, s.x, values, model.kernel, model.physics.smoothing, backend=model.backend, **options)
         met = sums["weight"] > jnp.finfo(s.x.dtype).smallest_normal ** 0.5  # whose square is a divisor of derivatives
-        return jnp.where(met, sums["p"] / jnp.where(met, sums["weight"], 1), 0)
+        return jnp.where(known, jnp.where(met, sums["p"] / jnp.where(met, sums["weight"], 1), 0), jnp.nan)
 
     return probe
 

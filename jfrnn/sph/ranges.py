@@ -6,6 +6,10 @@ from typing import Annotated, Any, Union, get_args, get_origin
 from pydantic import Field, TypeAdapter, ValidationError
 
 Bounds = dict[str, float]
+MANY: Bounds = {"ge": 1, "le": 1_000_000}
+"""Of snapshots, and of lines for each."""
+SKIN: Bounds = {"ge": 0.01, "le": 100}
+"""Of a list, in particle spacings."""
 
 _ABOVE_0: Bounds = {"gt": 0}
 _FROM_0: Bounds = {"ge": 0}
@@ -30,6 +34,7 @@ RANGES: dict[str, Bounds] = {
     "teeth": {"ge": 5, "le": 1000},
     "faces": {"ge": 100, "le": 10_000_000},
     "jitter": {"ge": 0, "le": 0.5},
+    "cfl": {"gt": 0, "le": 1},
     "restitution": {"ge": 0, "le": 1},
     "tank": {"ge": 1, "le": 1000},
     "spacing": {"ge": 0.002, "le": 1},

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import numpy as np
@@ -13,7 +13,7 @@ from jax import Array
 
 import jfrnn
 from jfrnn.cases.fluids import GasScene, Scene
-from jfrnn.sph import health, settings, snapshots, solids, solver
+from jfrnn.sph import health, ranges, series, settings, snapshots, solids, solver
 from jfrnn.sph.errors import SceneError
 from jfrnn.sph.interrupts import hold_interrupts
 from jfrnn.sph.model import choose_dtype, make_model, make_state
@@ -34,6 +34,7 @@ class How:
         skin: Of the list, in particle spacings.
         pictures: Whether frames and a GIF are drawn.
         lines: Lines of the tables, energies.csv and probes.csv, for each snapshot.
+        hdf: Whether all snapshots also go into one file, NAME.vtkhdf; takes h5py.
     """
 
     frames: int = 50
@@ -42,6 +43,22 @@ class How:
     skin: float = 0.3
     pictures: bool = True
     lines: int = 1
+    hdf: bool = False
+
+    def __post_init__(self) -> None:
+        """Refuse what the command line would.
+
+        Raises:
+            SceneError: Names the field.
+        """
+        kinds = {"frames": int, "lines": int, "skin": float, "neighbors": Literal["auto", "pair_sum", "list"]}
+        bounds = {"frames": ranges.MANY, "lines": ranges.MANY, "skin": ranges.SKIN}
+        for name, kind in kinds.items():
+            value = getattr(self, name)
+            try:
+                object.__setattr__(self, name, ranges.read(kind, value, bounds.get(name)))  # frozen; the text "2" is 2
+            except ValueError as error:
+                raise SceneError(f"{name}: got {value!r}; {error}") from error
 
 
 SECONDS, MOST_STEPS = 0.5, 100_000  # between two looks at a run
@@ -73,7 +90,7 @@ def run(
     Args:
         scene: The scene.
         folder: Gets run.json, energies.csv, probes.csv, snapshots/STEP.npz and .vtp, NAME.pvd, the series of those for ParaView,
-            frames/STEP.png, NAME.gif.
+            frames/STEP.png, NAME.gif; and, if asked for, NAME.vtkhdf.
         how: Options.
         force: As in `make_model`. It is no part of run.json: who goes on with a run gives the same.
         probes: Functions (model, state) -> numbers, arrays or dicts of them, inside jit, whose values are columns of probes.csv.
@@ -87,6 +104,8 @@ def run(
         KeyboardInterrupt: Ctrl-C came.
     """
     folder, dtype = Path(folder), choose_dtype(how.dtype)
+    if how.hdf:
+        series.check_library()
     with hold_interrupts() as stopped:
         try:
             model, first = make_model(scene, dtype, force=force), make_state(scene, dtype)  # what is refused leaves no folder
@@ -101,6 +120,7 @@ def run(
             s = jax.jit(solver.begin)(model, s, nbrs)
             write.line(s, step)
             write.snapshot(s, nbrs, step)
+        write.series(step)
         moments = how.frames * how.lines
         progress = Progress(how.frames, round(how.frames * float(s.time) / scene.duration))
         start, step_before = perf_counter(), step
@@ -161,7 +181,10 @@ def _first_neighbors(scene: Scene, model: Flow, s: State, how: How) -> Neighbors
     way = faster_way(jax.default_backend(), scene.n) if how.neighbors == "auto" else how.neighbors
     nbrs = solver.list_neighbors(model, s, how.skin * scene.spacing) if way == "list" else None
     if how.neighbors == "list" and nbrs is None:
-        raise SceneError(f"neighbors 'list': which pairs scene {scene.name!r} has changes in every step; take pair_sum or auto")
+        thin = " beside its thin solid (thin=False of the solid leaves that out)" if scene.solid else ""
+        raise SceneError(
+            f"neighbors 'list': which pairs scene {scene.name!r} has{thin} changes in every step; take pair_sum or auto"
+        )
     return nbrs
 
 
@@ -229,3 +252,9 @@ class _Writer:
             frames.draw(scene, there, x, v, time, float(top), self._folder / "frames" / f"{step:09d}.png")
         snapshots.save(s, scene, np.asarray(rho), np.asarray(p), self._folder / "snapshots", step)
         snapshots.add_to_series(self._folder / f"{scene.name}.pvd", float(s.time), step)
+        self.series(step)
+
+    def series(self, step: int) -> None:
+        """Bring the one file of all snapshots up to this step, where it is asked for."""
+        if self._how.hdf:
+            series.follow(self._folder / f"{self._scene.name}.vtkhdf", self._folder / "snapshots", step)

@@ -18,6 +18,7 @@ import jfrnn
 _OPPOSITE = -0.5  # cosine of the angle between normals, from which on two faces look away from each other
 _ROUNDING = 64
 _BLOCK = 1 << 20
+_MANY = 1 << 15  # points on faces from which on not all of them are asked
 _LEAST, _ROOM = 1024, 1.5
 
 
@@ -64,21 +65,43 @@ def points_on(corners: np.ndarray) -> np.ndarray:
     return np.concatenate([middle, corners + (middle - corners) / 16], axis=1).reshape(-1, corners.shape[2])
 
 
-def is_thin(corners: np.ndarray, tri: jfrnn.TriangleList) -> bool:
+def points_to_ask(corners: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return points on faces, shape [p, d], and the face of each, shape [p]: all `points_on`, of fine meshes some.
+
+    Of a fine mesh, points in one cell of an eighth of the reach whose faces look the same way count once.
+    """
+    points = points_on(corners)
+    faces = np.arange(len(points)) // (len(points) // len(corners))
+    if len(points) <= _MANY:
+        return points, faces
+    cells = np.floor(points / (reach / 8)).astype(np.int64)
+    ways = np.round(_normals(corners)).astype(np.int64)[faces]
+    first = np.unique(np.concatenate([cells, ways], axis=1), axis=0, return_index=True)[1]
+    return points[first], faces[first]
+
+
+def _normals(corners: np.ndarray) -> np.ndarray:
+    """Return unit normals of faces, shape [f, d]; 0 where a face has none."""
+    along = corners[:, 1:] - corners[:, :1]
+    normals = np.cross(along[:, 0], along[:, 1]) if along.shape[2] == len("xyz") else along[:, 0, ::-1] * (1, -1)
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    return normals / np.where(length > 0, length, 1)
+
+
+def is_thin(corners: np.ndarray, asked: tuple[np.ndarray, np.ndarray], tri: jfrnn.TriangleList) -> bool:
     """Say whether faces that look away from each other, with the solid between them, are closer than the cutoff.
 
     Args:
         corners: Of faces [length], shape [f, d, d].
-        tri: The triangles near `points_on` these faces.
+        asked: From `points_to_ask`.
+        tri: The triangles near those points.
     """
-    points, along = points_on(corners), corners[:, 1:] - corners[:, :1]
-    normals = np.cross(along[:, 0], along[:, 1]) if along.shape[2] == len("xyz") else along[:, 0, ::-1] * (1, -1)
-    length = np.linalg.norm(normals, axis=1, keepdims=True)
-    normals = normals / np.where(length > 0, length, 1)
+    points, faces = asked
+    normals = _normals(corners)
     idx, used = np.asarray(tri.idx), np.arange(tri.capacity) < np.asarray(tri.count)[:, None]
     for block in np.array_split(np.arange(len(points)), -(-idx.size // _BLOCK)):
         rows, slots = np.nonzero(used[block])
-        own, other = block[rows] // (len(points) // len(corners)), idx[block[rows], slots]
+        own, other = faces[block[rows]], idx[block[rows], slots]
         away = np.sum(normals[own] * normals[other], axis=1) < _OPPOSITE
         point, own, other = points[block[rows[away]]], own[away], other[away]
         seen = corners[other] - point[:, None]

@@ -29,6 +29,7 @@ from jfrnn.sph.pairs import reach
 from jfrnn.sph.particles import Beside, Model, State, active
 
 GAP = 0.2  # particle spacings: on a lattice, particles at a wall are half a spacing away
+_ROOM_AROUND = 2  # times the particles that are near a point in a fluid on a lattice
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
 _PLACES, _SHARES = (_NODES + 1) / 2, _WEIGHTS / 2
 
@@ -48,16 +49,10 @@ def begin(scene: FluidScene, x: Array, angle: Array | None = None) -> Beside | N
     if solid is None:
         return None
     vertices, faces, cutoff = jnp.asarray(solid.vertices, x.dtype), jnp.asarray(solid.faces), _reach(scene)
-    corners = np.asarray(vertices)[solid.faces]
-    on_wall = jfrnn.search_triangles(sight.points_on(corners), vertices, faces, cutoff)
-    thin = sight.is_thin(corners, on_wall) if solid.thin is None else solid.thin
-    capacity = -(-int(on_wall.required) * 3 // 16) * 8  # half as many again; a run that needs more is told by `overflow`
     turning = turning_of(scene, x.dtype)
     angle = jnp.zeros((), x.dtype) if turning is not None and angle is None else angle
     at = into_frame(x, turning, angle)
-    tri = jfrnn.search_triangles(at, vertices, faces, cutoff, capacity=capacity)
-    if tri.overflow:  # in a finely meshed solid, in the middle of which more triangles are near than anywhere on it
-        tri = jfrnn.search_triangles(at, vertices, faces, cutoff)
+    tri = jfrnn.search_triangles(at, vertices, faces, cutoff)
     signed = tri.signed_distance(at)
     if not signed.watertight:
         raise SceneError(
@@ -71,6 +66,13 @@ def begin(scene: FluidScene, x: Array, angle: Array | None = None) -> Beside | N
         raise SceneError(
             f"positions of the fluid must be outside the solid by {GAP / 2} spacings: particle {inside.argmax()} is not."
         )
+    corners = np.asarray(vertices)[solid.faces]
+    asked = sight.points_to_ask(corners, cutoff)
+    on_wall = jfrnn.search_triangles(asked[0], vertices, faces, cutoff)
+    thin = sight.is_thin(corners, asked, on_wall) if solid.thin is None else solid.thin
+    capacity = -(-int(on_wall.required) * 3 // 16) * 8  # half as many again; a run that needs more is told by `overflow`
+    if tri.capacity < capacity:
+        tri = jfrnn.search_triangles(at, vertices, faces, cutoff, capacity=capacity)
     seen = Beside(tri, angle, signed.mask, signed.distance, signed.normal)
     if not thin:
         return seen
@@ -90,6 +92,31 @@ def _look_through(seen: Beside, at: Array, room: sight.Sight, neighbors: float) 
         if not found.overflow:
             return seen._replace(sight=found)
         room = sight.make_room(np.asarray(found.required), neighbors, len(at))
+
+
+def hidden(model: Model, s: State, beside: Beside, points: Array) -> tuple[Array, Array]:
+    """Find the particles that cannot be seen from points, because a triangle is between.
+
+    Args:
+        model: What acts.
+        s: The state.
+        beside: The wall as particles see it.
+        points: Where one looks from [m], shape [k, d].
+
+    Returns:
+        Pairs of a point and a particle within the cutoff that the wall parts, shape [e, 2], int32, -1 where there are fewer; and
+        whether there was room for all of them, shape [].
+    """
+    count, (n, dim) = len(points), s.x.shape
+    room = math.ceil(_ROOM_AROUND * count * _neighbors(model.spacing, model.cutoff, dim))
+    edges = jfrnn.search_edges(s.x, model.cutoff, queries=points, active=active(model, s), total=min(room, count * n))
+    at, seen = (into_frame(x, model.turning, beside.angle) for x in (s.x, points))
+    tri, rows = beside.tri, jnp.concatenate([at, jnp.broadcast_to(at[:1], seen.shape)])
+    around = jfrnn.search_triangles(rows, tri.vertices, tri.faces, tri.cutoff, capacity=tri.capacity)  # rows of particles are read
+    asked = jnp.stack([edges.senders, n + edges.receivers], axis=1)
+    parted = around.between(jnp.concatenate([at, seen]), asked)
+    pairs = jnp.stack([edges.receivers, edges.senders], axis=1)
+    return jnp.where(parted[:, None], pairs, -1), ~(edges.overflow | around.overflow)
 
 
 def grow(model: Model, s: State, after: Beside) -> State:

@@ -9,12 +9,15 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from jfrnn.cases.fluids import FluidScene, Periodic, Physics, Solid, Tank, Turning, inflow, lattice
+from jfrnn.sph import ranges
 from jfrnn.sph.check import check_physics, check_scene
 from jfrnn.sph.errors import SceneError
 from jfrnn.sph.files import read_solid
 from jfrnn.sph.kernels import KERNELS
+from jfrnn.sph.relaxing import relax
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Many = Annotated[int, Field(ge=ranges.MANY["ge"], le=ranges.MANY["le"])]
 Place = list[Annotated[float, Field(allow_inf_nan=False)]]
 
 
@@ -74,6 +77,16 @@ class Box(_Table):
     axes: str
 
 
+class Output(_Table):
+    """What a run writes: a snapshot each so many seconds, or so many of them; the rest as in `How`."""
+
+    interval: Positive | None = None
+    frames: Many | None = None
+    lines: Many = 1
+    pictures: bool = True
+    hdf: bool = False
+
+
 class Own(_Table):
     """The whole file."""
 
@@ -87,6 +100,8 @@ class Own(_Table):
     periodic: Box | None = None
     bounds: Corners | None = None
     solid: SolidFile | None = None
+    output: Output = Output()
+    relax: bool = False
     physics: dict[str, Any]
 
 
@@ -97,8 +112,37 @@ def read_scene(path: Path | str) -> FluidScene:
         SceneError: The file cannot be read, has keys that mean nothing or values out of range, or the scene cannot be run.
     """
     path = Path(path)
+    given = _read(path)
     try:
-        given = Own.model_validate(tomllib.loads(path.read_text(encoding="utf-8")))
+        scene = _make(given, path)
+        check_scene(scene)
+        scene = relax(scene) if given.relax else scene
+    except SceneError as error:
+        raise SceneError(f"{path}: {error}") from error
+    return scene
+
+
+def read_output(path: Path | str) -> dict[str, Any]:
+    """Return what the `[output]` of a TOML file says, by the names that `How` has for it.
+
+    Raises:
+        SceneError: As `read_scene`; or there is no whole number of intervals in the duration.
+    """
+    given = _read(Path(path))
+    said, interval = given.output.model_dump(exclude_unset=True), given.output.interval
+    if interval is None:
+        return said
+    if given.output.frames is not None:
+        raise SceneError(f"{path}: output: has an interval and frames, of which one says all; leave the other out")
+    frames = round(given.duration / interval)
+    if frames < 1 or abs(frames * interval - given.duration) > 1e-9 * given.duration:
+        raise SceneError(f"{path}: output.interval: a duration of {given.duration:g} s is no whole number of {interval:g} s")
+    return {name: value for name, value in said.items() if name != "interval"} | {"frames": frames}
+
+
+def _read(path: Path) -> Own:
+    try:
+        return Own.model_validate(tomllib.loads(path.read_text(encoding="utf-8")))
     except OSError as error:
         raise SceneError(f"{path}: cannot be read ({error.strerror})") from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
@@ -107,12 +151,6 @@ def read_scene(path: Path | str) -> FluidScene:
         first = error.errors()[0]
         where = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in first["loc"]).removeprefix(".")
         raise SceneError(f"{path}: {where}: {first['msg'].lower()}, got {first['input']!r}"[:300]) from error
-    try:
-        scene = _make(given, path)
-        check_scene(scene)
-    except SceneError as error:
-        raise SceneError(f"{path}: {error}") from error
-    return scene
 
 
 def _make(given: Own, path: Path) -> FluidScene:

@@ -21,7 +21,7 @@ BENCH = (
     *("crossover", "crystals", "distributed", "arrays", "latency", "lj", "options", "peers", "skin", "start", "guides"),
     *("structures", "sums", "ties", "triangles"),
 )
-SPH = ("validate", "speed", "gradients")
+SPH = ("validate", "speed", "gradients", "peers", "thin", "start")
 COMMANDS = (*TOP[:9], *(f"bench {name}" for name in BENCH), *(f"sph {name}" for name in SPH))
 
 
@@ -179,6 +179,9 @@ def test_steps_are_timed_of_scenes_that_have_an_nx(tmp_path):
         ("sph", "speed", CONFIGS / "sph_speed.toml"),
         ("sph", "validate", "one"),
         ("sph", "gradients", "memory"),
+        ("sph", "peers"),
+        ("sph", "start"),
+        ("sph", "thin"),
         *(("bench", name) for name in ("options", "ties", "crossover", "triangles", "skin", "latency", "start")),
         ("bench", "peers", "scipy"),
     ],

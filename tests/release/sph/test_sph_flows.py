@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -10,7 +11,9 @@ import jfrnn
 from experiments.sph import vortices
 from jfrnn.cases import fluids
 from jfrnn.cases._fluid_flows import taylor_green_velocity
-from jfrnn.sph import budget, forces, health, solver
+from jfrnn.sph import budget, forces, health, relax, solver
+from jfrnn.sph.errors import SceneError
+from jfrnn.sph.kernels import KERNELS
 from jfrnn.sph.model import make_model, make_state
 from jfrnn.sph.particles import active
 
@@ -174,7 +177,47 @@ def test_the_courant_step_follows_the_scene():
     model, s = begun(scene)
     h, c = scene.physics.smoothing, scene.physics.sound_speed
     assert solver.courant(model, s) == pytest.approx(min(0.25 * h / c, 0.25 * np.sqrt(h / 9.81)), rel=0.3)
+    slow = replace(model, physics=replace(model.physics, cfl=jnp.asarray(0.1)))
+    assert solver.courant(slow, s) == pytest.approx(0.4 * solver.courant(model, s))
     later, _ = solver.advance(model, s, None, 20)
     assert later.last < 0.25 * h / c
     with pytest.raises(ValueError, match="multiple of segments"):
         solver.rollout(model, s, 10, segments=3)
+
+
+def crowding(scene, x):
+    """Return h Σ V ∇W by all pairs, in a box of 1 m."""
+    h, r = scene.physics.smoothing, x[None] - x[:, None]
+    r = r - np.round(r)
+    pull = np.asarray(KERNELS["quintic"].pull(np.linalg.norm(r, axis=2), h, 2))
+    return -h * scene.spacing**2 * np.sum(pull[..., None] * r, axis=1)
+
+
+def displaced(scene):
+    return scene.positions + scene.spacing / 4 * np.random.default_rng(0).normal(size=scene.positions.shape)
+
+
+def test_a_relaxed_start_is_even_and_carries_the_flow_along():
+    scene = fluids.fluid("taylor-green", nx=16, jitter=0.0, transport=100.0)
+    relaxed = relax(scene)
+    moved = np.linalg.norm(relaxed.positions - scene.positions, axis=1)
+    assert scene.spacing / 4 < np.mean(moved) < scene.spacing
+    exact = taylor_green_velocity(relaxed.positions, 0.0, 100.0)
+    np.testing.assert_allclose(relaxed.velocities, exact, atol=0.04)
+    exact = -0.25 * np.cos(4 * np.pi * relaxed.positions).sum(axis=1)
+    np.testing.assert_allclose(relaxed.pressures, exact, atol=0.08)
+    pushes = [np.linalg.norm(crowding(scene, x), axis=1).max() for x in (relaxed.positions, displaced(scene))]
+    assert pushes[0] < 1.1e-3 < 0.1 < pushes[1]
+    np.testing.assert_array_equal(relax(scene).positions, relaxed.positions)
+
+
+def test_walls_stay_where_a_start_is_relaxed_and_open_sides_are_refused():
+    scene = fluids.fluid("cavity", nx=10)
+    relaxed = relax(scene)
+    np.testing.assert_array_equal(relaxed.positions[scene.wall], scene.positions[scene.wall])
+    np.testing.assert_array_equal(relaxed.velocities, scene.velocities)
+    assert np.all(np.abs(relaxed.positions[~scene.wall] - 0.5) < 0.5)
+    with pytest.raises(SceneError, match=r"relax: particle \d+ of the fluid has an open side"):
+        relax(fluids.fluid("dam-break-2d", nx=8))
+    with pytest.raises(SceneError, match="relax: expected a fluid without solid and inflow"):
+        relax(fluids.gas("sedov"))

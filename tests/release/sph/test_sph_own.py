@@ -1,14 +1,18 @@
 """What users bring and take: own forces, outflow, probes, a run that goes on for longer."""
 
 import json
+import sys
 from dataclasses import replace
 
+import h5py
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import pyvista
 from jax.tree_util import Partial
 from places import ROOT
 from test_sph_commands import invoke, read_table
+from vtkmodules.vtkIOHDF import vtkHDFReader
 
 import jfrnn
 from jfrnn import sph
@@ -137,6 +141,71 @@ def test_a_scene_from_a_file(tmp_path):
     assert json.loads((tmp_path / "out" / "run.json").read_text())["made_by"]["jfrnn"] == jfrnn.__version__
 
 
+def test_all_snapshots_go_into_one_file_that_paraview_reads(tmp_path, monkeypatch):
+    """Also where a run was stopped and its series was left half written, and where it is asked for when the run has ended."""
+    (tmp_path / "bath.toml").write_text(BATH + "[output]\ninterval = 0.005\nhdf = true\n")
+    options = ("run", tmp_path / "bath.toml", "--no-pictures", "--out", tmp_path)
+    assert invoke(*options)[0] == 0
+
+    def check():
+        reader = vtkHDFReader()
+        reader.SetFileName(str(tmp_path / "bath.vtkhdf"))
+        reader.UpdateInformation()
+        frames = sorted((tmp_path / "snapshots").glob("*.vtp"))
+        assert reader.GetNumberOfSteps() == len(frames) == 3
+        for step, path in enumerate(frames):
+            reader.SetStep(step)
+            reader.Update()
+            assert reader.GetTimeValue() == step * 0.005
+            seen, cloud = pyvista.wrap(reader.GetOutputDataObject(0)), pyvista.read(path)
+            np.testing.assert_array_equal(seen.points, cloud.points)
+            np.testing.assert_array_equal(seen.verts, cloud.verts)
+            assert set(seen.point_data) == set(cloud.point_data) == {"velocity", "density", "pressure", "wall"}
+            for name, array in cloud.point_data.items():
+                np.testing.assert_array_equal(seen.point_data[name], array)
+
+    check()
+    (tmp_path / "snapshots" / "000000002.npz").unlink()  # goes on from step 1
+    assert invoke(*options)[0] == 0
+    check()
+    with h5py.File(tmp_path / "bath.vtkhdf", "r+") as file:
+        file.attrs["whole"] = False
+        file["VTKHDF/Points"][...] = 0
+    assert invoke(*options)[0] == 0
+    check()
+    monkeypatch.setitem(sys.modules, "h5py", None)
+    assert "hdf: a file .vtkhdf is written by h5py, which is not installed: pip install h5py" in invoke(*options)[2]
+    assert invoke(*options, "--no-hdf")[0] == 0
+
+
+@pytest.mark.parametrize(
+    ("told", "message"),
+    [
+        ({"frames": 0}, r"frames: got 0; input should be greater than or equal to 1 \(from 1 to 1 000 000\)"),
+        ({"frames": "few"}, "frames: got 'few'; input should be a valid integer"),
+        ({"skin": -1.0}, "skin: got -1.0; input should be greater than or equal to 0.01"),
+        ({"neighbors": "verlet"}, "neighbors: got 'verlet'; input should be 'auto', 'pair_sum' or 'list'"),
+    ],
+)
+def test_a_mistake_in_how_a_scene_is_run_is_named(told, message):
+    with pytest.raises(SceneError, match=message):
+        sph.How(**told)
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        ("interval = 0.004", "output.interval: a duration of 0.01 s is no whole number of 0.004 s"),
+        ("interval = 0.005\nframes = 2", "output: has an interval and frames, of which one says all"),
+        ("frames = 0", "output.frames: input should be greater than or equal to 1, got 0"),
+    ],
+)
+def test_a_mistake_in_what_is_written_is_named(tmp_path, more, message):
+    (tmp_path / "bath.toml").write_text(BATH + f"[output]\n{more}\n")
+    assert f"bath.toml: {message}" in invoke("run", tmp_path / "bath.toml", "--out", tmp_path / "out")[2]
+    assert not (tmp_path / "out").exists()
+
+
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
@@ -145,6 +214,7 @@ def test_a_scene_from_a_file(tmp_path):
         ("step = 0.005", "steps = 0.005", "steps: extra inputs are not permitted"),
         ("sound_speed = 10.0", "sound = 10.0", "physics: got an unexpected keyword argument 'sound'"),
         ("density = 1000.0", "density = -1.0", "physics.density: got -1.0; input should be greater than 0"),
+        ("density = 1000.0", "cfl = 0.0\ndensity = 1000.0", "physics.cfl: got 0.0; input should be greater than 0"),
         ("density = 1000.0", 'kernel = "gauss"\ndensity = 1.0', "physics.kernel: got 'gauss'; input should be 'cubic', "),
         ("upper = [0.4, 0.3]", "upper = [0.04, 0.3]", "fill: from .* there is no room for particles 0.1 m apart"),
         ("velocity = [0.5, 0.0]", "velocity = [0.5]", "fill.velocity must have 2 numbers"),
