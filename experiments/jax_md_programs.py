@@ -53,10 +53,10 @@ def run_jax_sph(case: str, who: str, checkout: str) -> dict[str, np.ndarray]:
     sys.argv = ["main.py", *words]
     runpy.run_path("main.py", run_name="__main__")
     os.chdir(folder)
-    import h5py  # pyright: ignore[reportMissingImports]
+    import h5py
 
     with h5py.File(max(folder.rglob("traj_*.h5"))) as last:
-        return {name: last[name][()] for name in last}
+        return {str(name): np.asarray(values) for name, values in last.items()}
 
 
 def run_in_jax_md(who: str) -> dict[str, np.ndarray]:

@@ -48,7 +48,7 @@ def follow(path: Path, snapshots: Path, step: int) -> None:
     with file:
         file.attrs[_WHOLE] = False
         file.flush()
-        there = file["steps"][:]
+        there = np.asarray(file["steps"])
         kept = int(np.argmin(np.append(there[: len(frames)] == np.array(list(frames))[: len(there)], False)))
         _cut(file, kept)
         for number, frame in list(frames.items())[kept:]:
