@@ -94,7 +94,8 @@ def draw_tradeoff(rows: list[StepRow]) -> Figure:
     errors = [row.error["l2 of velocity"] for row in last.values()]
     seconds = [row.seconds or 0 for row in last.values()]
     ratio = factor(max(seconds) / min(seconds)) if min(seconds) else "many"
-    title = f"At {rows[-1].nx}² particles all ways err by {min(errors):.2g} to {max(errors):.2g}, and differ {ratio} times in time"
+    spread = " to ".join(dict.fromkeys(f"{each:.2g}" for each in (min(errors), max(errors))))
+    title = f"At {rows[-1].nx}² particles all ways err by {spread}, and the slowest takes {ratio} times as long as the fastest"
     figure, axes = make_axes(title, 4.4)
     skins = sorted({skin for _, skin in lines}, key=lambda skin: skin or 0)
     ends = []
