@@ -1,4 +1,4 @@
-"""The pictures that lead the pages of benchmarks, the library in color, others in grey with their names; and two sketches.
+"""The pictures that lead the pages of benchmarks, each library in a color of its own; and two sketches.
 
 They are drawn from rows whenever the pages are built, so that no picture is older than its rows.
 """
@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
 
-from experiments._look import OURS, PEER, dress, factor, head, plain, write_names
+from experiments._look import OURS, PEER, PEERS_COLORS, dress, factor, head, plain, write_names
 from experiments.pages import cpu, liquid, options
 from experiments.pages.rows import machine, number, one, read, whole
 
@@ -74,7 +74,7 @@ def _gpu(axes: Axes) -> None:
     for method, title in _GPU.items():
         found[method] = {row["points"]: 1e3 * row["median_s"] for row in rows if row["method"] == method}
         x, y = zip(*sorted(found[method].items()), strict=True)
-        color, marker = (OURS, "o") if title.startswith("jfrnn") else (PEER, "s" if "Hash" in title else "^")
+        color, marker = (OURS, "o") if title.startswith("jfrnn") else (PEERS_COLORS[len(ends) - 1], "s" if "Hash" in title else "^")
         axes.plot(x, y, color=color, marker=marker)
         ends.append((title, x[-1], y[-1], color))
     axes.set(xscale="log", yscale="log", xlabel="particles, 108 neighbors on average, one H200", ylabel="milliseconds of a list")
@@ -94,12 +94,13 @@ def _gpu(axes: Axes) -> None:
 def _liquid() -> Figure:
     """Draw steps per second of a Lennard-Jones liquid over particles, a line for each way, a panel for each machine."""
     figure = Figure(figsize=(7.0, 0.5 + 3.2 * len(liquid.MACHINES)), layout="constrained")
+    libraries = list(dict.fromkeys(who.partition(" ")[0] for who in _LIQUID if who not in liquid.OURS))
     for axes, platform in zip(np.ravel(figure.subplots(len(liquid.MACHINES))), liquid.MACHINES, strict=True):
         rows, ends = liquid.rows_of(platform), []
         for who, style in _LIQUID.items():
             points = [(n, float(row["steps_per_s"])) for n, row in sorted(liquid.speeds(rows, who).items())]
             if points:
-                color = OURS if who in liquid.OURS else PEER
+                color = OURS if who in liquid.OURS else PEERS_COLORS[libraries.index(who.partition(" ")[0])]
                 axes.plot(*zip(*points, strict=True), style, color=color, ms=5)
                 ends.append((f"jfrnn, {who}" if who in liquid.OURS else who, *points[-1], color))
         dress(axes, f"particles, {machine(rows)}", "steps per second")
