@@ -9,7 +9,7 @@ from jfrnn.kernels.cells_cuda import place_words
 
 BLOCK = 256
 _MOST_BLOCKS = 1024
-MOST_TURNS = (0, *((1 << k) - 1 for k in range(1, 10)))  # for which a search is told how far rounding goes, one of them
+MOST_TURNS = (0, *((1 << k) - 1 for k in range(1, 10)))  # how far rounding goes is known for each of them, and one is chosen
 
 
 class RenewKernels(NamedTuple):
@@ -27,16 +27,11 @@ def blocks(n: int) -> int:
 
 
 @functools.lru_cache(64)
-def renew_kernels(dim: int, double: bool, periodic: bool, ordered: bool, bits: tuple[int, int, int]) -> RenewKernels:
-    """Return the kernels for a dimension, a dtype and a space.
-
-    `bits` are those of a status for particles that are not finite, for those too far away, and for a box that is too small.
-    """
+def renew_kernels(dim: int, double: bool, periodic: bool, ordered: bool, told: tuple[tuple[str, int], ...]) -> RenewKernels:
+    """Return the kernels for a dimension, a dtype and a space; `told` are constants that other floors decide, with their names."""
     first, words, word = place_words(2 if double else 1)
-    names = ("BIT_NOT_FINITE", "BIT_OUT_OF_RANGE", "BIT_BOX_TOO_SMALL")
     constants = {"ORDERED": ordered, "FIRST_PLACE": first, "PLACE_WORDS": words, "PLACE_WORD": word, "BLOCK": BLOCK}
-    constants |= dict(zip(names, bits, strict=True))
-    text = program(double, dim, "renew.cuh", PERIODIC=periodic, **constants)
+    text = program(double, dim, "renew.cuh", PERIODIC=periodic, **constants, **dict(told))
     variant = f"{dim}d_{'f64' if double else 'f32'}{'_nearest' * periodic}{'_ordered' * ordered}"
     entries = [Entry(f"Renew.{method}", BLOCK, 4) for method in RenewKernels._fields]
     return RenewKernels(*declare(f"renew_cuda_{variant}", text, *entries, cuda=True))

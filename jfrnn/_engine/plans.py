@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 PLACES_PER_THREAD = 512  # below, a second thread costs more than it saves
 _HUGE = 1 << 22  # bytes from which an array is worth a request for huge pages
-_MOST_BYTES, _MOST_ARRAYS, MOST_WORDS, _MOST_RECORDED = 1024, 48, 1024, 8  # those of the native code
+_MOST_BYTES, _MOST_ARRAYS, MOST_WORDS, _MOST_RECORDED, _MOST_ASKED = 1024, 48, 1024, 8, 1024  # those of the native code
 _ONCE, _SHARED, _CUDA, _CUDA_BESIDE, _CLEAR, _HUGE_PAGES = range(6)
 _MAY_LACK = (*EXCLUDED, *TABLE, "radii", "query_radii", "grids")  # arguments that kernels name, and some of them do not read
 _STREAM = "stream"  # the name of an argument that gets the stream of the call, as if that were an array
@@ -220,6 +220,8 @@ def lay_plan(name: str, plan: Plan, shapes: Mapping[str, tuple[int, ...]], devic
     found.asked = -1 if plan.asked is None else arrays.index(plan.asked)
     found.asked_words = 0 if plan.asked is None else math.prod(shapes[plan.asked])
     if plan.asked is not None:
+        if found.asked_words > _MOST_ASKED:
+            raise ValueError(f"{name} asks {found.asked_words} words, more than {_MOST_ASKED}")
         held.append(recorder := _make_recorder(device))
         found.recorder = recorder and ctypes.addressof(recorder)
     if any(step.kind == _CUDA_BESIDE for step in laid):

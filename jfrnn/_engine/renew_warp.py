@@ -19,10 +19,24 @@ from jfrnn._engine.plans import Launch, Plan
 from jfrnn._engine.problem import Inputs, Options
 from jfrnn._engine.variants import Variant, describe_call
 from jfrnn._engine.warp import PLATFORMS, WarpEngine, all_meet, plan_few, plan_on_cuda
-from jfrnn._geometry import Box, Cutoff, Status, bound_wrapping, is_valid, make_lattice
+from jfrnn._geometry import (
+    FAR,
+    FAR_BITS,
+    FAR_STEP,
+    LARGEST_TURN,
+    NOT_FINITE,
+    TOO_FAR,
+    Box,
+    Cutoff,
+    Status,
+    bound_wrapping,
+    is_valid,
+    make_lattice,
+)
 from jfrnn.kernels import cells_cuda, few_cuda, renew
 
-_BITS = Status.NONFINITE.value, Status.OUT_OF_RANGE.value, Status.BOX_TOO_SMALL.value
+_BITS = {"NOT_FINITE": Status.NONFINITE, "OUT_OF_RANGE": Status.OUT_OF_RANGE, "BOX_TOO_SMALL": Status.BOX_TOO_SMALL}
+_FAR = {"FAR": FAR, "FAR_STEP": FAR_STEP, "LARGEST_TURN": LARGEST_TURN, "MET_NOT_FINITE": NOT_FINITE, "MET_TOO_FAR": TOO_FAR}
 _KEPT = ("idx", "counts", "status", "required", "rebuild_count", "reference")
 _KEPT_OF_BOX = ("kept_vectors", "kept_origin")
 
@@ -58,6 +72,12 @@ def can_renew(inputs: Inputs, options: Options, capacity: int) -> bool:
     boxed = images is None or (images.nearest and images.orthogonal and not images.counts_short and not images.per_system)
     n = inputs.sources.shape[0]
     return plain and alone and boxed and capacity > 0 and 0 < n < MOST_IN_BOX
+
+
+def constants_of(double: bool) -> tuple[tuple[str, int], ...]:
+    """Return what kernels are told of bits of a status, and of far points, as array programs have it."""
+    bits = {f"BIT_{name}": bit.value for name, bit in _BITS.items()}
+    return tuple((bits | _FAR | {"FAR_MOST": 1 << FAR_BITS[8 if double else 4]}).items())
 
 
 def numbers_of_box(inputs: Inputs, options: Options) -> Array:
@@ -127,7 +147,7 @@ def _plan(variant: Variant, few: bool, ordered: bool, shapes: Shapes, multiproce
     n, boxed = shapes["now"][0], variant.periodic > 0
     same = {"count": "counts"} | ({"queries": "positions"} if boxed else {"positions": "now", "queries": "now"})
     search = (plan_few if few else plan_on_cuda)(variant, dict(shapes) | {"positions": (n,), "queries": (n,)}, multiprocessors)
-    around = renew.renew_kernels(variant.dim, variant.double, boxed, ordered, _BITS)
+    around = renew.renew_kernels(variant.dim, variant.double, boxed, ordered, constants_of(variant.double))
     blocks = renew.blocks(n)
     check, prepare, keep = (Launch(each, blocks * renew.BLOCK) for each in (around.check, around.prepare, around.keep))
     steps = [check, prepare, Launch(around.settle, renew.BLOCK), *search.steps, keep]

@@ -32,6 +32,7 @@ from jfrnn._geometry.exact import (
 )
 from jfrnn._geometry.excluded_images import ExcludedCodes, exclude_in_lattice, exclude_in_space
 from jfrnn._geometry.exclusions import Exclusions, check_exclusions, pairs_of_rows
+from jfrnn._geometry.far import FAR, FAR_BITS, FAR_STEP
 from jfrnn._geometry.floats import compensated_sum, rounded_product, rounded_scaled, rounded_sum
 from jfrnn._geometry.images import LARGEST_TURN, Images, box_of_list, grow_images, images_of, refuse_status
 from jfrnn._geometry.inputs import (

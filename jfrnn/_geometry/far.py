@@ -2,7 +2,7 @@
 
 Coordinates that nobody wraps, as those of a long molecular run, lie any number of boxes away. Kernels number the lattice vectors
 between a particle and its box by few bits, and the errors of wrapped coordinates grow with that number. So a particle that is at
-least `_FAR` vectors away is first moved by a multiple of `_STEP` of them, to coordinates that are floats again.
+least `FAR` vectors away is first moved by a multiple of `FAR_STEP` of them, to coordinates that are floats again.
 
 Why nothing is rounded where vectors lie along the axes: let A be a length in [1, 2), p the exponent of x, and s·256·A what is
 subtracted, with s = round(x / 256 A). A is the sum of two halves of its mantissa, so that both products are exact. In float32,
@@ -24,13 +24,13 @@ from jax import Array, lax
 
 from jfrnn._geometry.floats import half_mantissa, two_sum
 
-_STEP, _FAR = 256, 192
-_BITS = {4: 11, 8: 22}  # of how many steps a particle is moved, by the size of a float [B]
+FAR_STEP, FAR = 256, 192
+FAR_BITS = {4: 11, 8: 22}  # of how many steps a particle is moved, by the size of a float [B]
 
 
 def is_far(units: Array) -> Array:
     """Say along which lattice vectors points are far, of their coordinates [n, d] along these."""
-    return jnp.abs(units) >= _FAR
+    return jnp.abs(units) >= FAR
 
 
 def move_near(
@@ -42,9 +42,9 @@ def move_near(
     each. Points that lie too far away, or that would be rounded, are not moved. Differentiable in points and matrix. What is done
     `rarely` is a loop: XLA compiles its body once.
     """
-    steps = jnp.round(units / _STEP)
-    far = is_far(units) & (jnp.abs(steps) <= 2.0 ** _BITS[points.dtype.itemsize]) & periodic
-    return _subtract(points, jnp.where(far, steps * _STEP, 0), matrix, orthogonal, rarely)
+    steps = jnp.round(units / FAR_STEP)
+    far = is_far(units) & (jnp.abs(steps) <= 2.0 ** FAR_BITS[points.dtype.itemsize]) & periodic
+    return _subtract(points, jnp.where(far, steps * FAR_STEP, 0), matrix, orthogonal, rarely)
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(3, 4))

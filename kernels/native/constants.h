@@ -57,8 +57,10 @@ constexpr bool DECIDED = true;    // which of its slots hold a pair
 constexpr bool MIRRORED = false;  // a term reads of i what it reads of j
 constexpr bool MEASURED = false;  // distances are written, too
 constexpr bool BOXES = false;     // each system has a lattice of its own
-// Of lists that renew themselves (see jfrnn/kernels/renew.py): bits of a status, and where the order of sources stands in a scratch.
+// Of lists that renew themselves (see jfrnn/kernels/renew.py): bits of a status, which points are far and what is met of turns, and
+// where the order of sources stands in a scratch.
 constexpr int BIT_NOT_FINITE = 2, BIT_OUT_OF_RANGE = 8, BIT_BOX_TOO_SMALL = 4;
+constexpr int FAR = 192, FAR_STEP = 256, FAR_MOST = 1 << 11, LARGEST_TURN = 511, MET_NOT_FINITE = 1 << 10, MET_TOO_FAR = 2 << 10;
 constexpr int FIRST_PLACE = 2624, PLACE_WORDS = 4, PLACE_WORD = 3;
 // Of triangles (see jfrnn/kernels/_triangles.py, triangles_cpu.py and triangles_cuda.py).
 constexpr int LIMBS = 14, ROOM = 1202, STRIDE = 1;

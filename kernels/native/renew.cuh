@@ -4,15 +4,15 @@
 // axes, and a pair has one image in it. Of a box that has changed since, nothing is known but that.
 #pragma once
 #include "band.h"
-#include "lattice.h"
+#include "space.h"
 
 struct RenewArguments {
-    const real* now;                               // [n, DIM], read, as all that follows but for what is kept and scratch
-    const real* limit;                             // [1] the square of a motion below which a list holds
-    const real* cutoffs;                           // [MOST_TURNS + 2, LATTICE_END + 1] what a search is given, by most turns; valid
-    const real *vectors, *origin;                  // [DIM] of the box
-    const int *info, *scratch;                     // what the search has found
-    real *reference, *kept_vectors, *kept_origin;  // kept: [n, DIM] and [DIM]
+    const real* now;      // [n, DIM], read, as all that follows but for what is kept and scratch
+    const real* limit;    // [1] the square of a motion below which a list holds
+    const real* cutoffs;  // a row of LATTICE_END + 1 for each number of turns: what a search is given; whether it is enough
+    const real *vectors, *origin;                    // [DIM] of the box
+    const int *info, *scratch;                       // what the search has found
+    real *reference, *kept_vectors, *kept_origin;    // kept: [n, DIM] and [DIM]
     int *status, *required, *rebuild_count, *order;  // kept: [1], and [n]
     real *positions, *cutoff;                        // scratch: [n, ROW] and [LATTICE_END], what the search is given
     int *stale, *parts;                              // scratch: [blocks] and [blocks, 2]
@@ -20,7 +20,6 @@ struct RenewArguments {
 };
 
 struct Renew : RenewArguments {
-    enum { STEP = 256, FAR = 192, LARGEST_TURN = 511, NOT_FINITE = 1 << 10, TOO_FAR = 2 << 10 };
     const Lattice lattice;
 
     JFRNN_MEMBER explicit Renew(const RenewArguments& given) : RenewArguments(given), lattice(given.cutoffs) {}
@@ -113,7 +112,8 @@ struct Renew : RenewArguments {
         if (threadIdx.x > 0)
             return;
         if constexpr (PERIODIC) {
-            bits = (bits & ~BIT_NOT_FINITE) | (met & NOT_FINITE ? BIT_NOT_FINITE : 0) | (met & TOO_FAR ? BIT_OUT_OF_RANGE : 0);
+            bits =
+                (bits & ~BIT_NOT_FINITE) | (met & MET_NOT_FINITE ? BIT_NOT_FINITE : 0) | (met & MET_TOO_FAR ? BIT_OUT_OF_RANGE : 0);
             bits |= cutoffs[row_of(met) * (LATTICE_END + 1) + LATTICE_END] != 0 ? 0 : BIT_BOX_TOO_SMALL;
         }
         *status |= bits;
@@ -123,24 +123,17 @@ struct Renew : RenewArguments {
 
 private:
     // The row of `cutoffs` that holds for all turns that were met: of 0, and of powers of two less one.
-    JFRNN_FUNCTION int row_of(int met) { return 32 - __clz(met & (NOT_FINITE - 1)); }
-    JFRNN_FUNCTION bool is_finite(const real* p) {
-        real sum = 0;
-        for (int k = 0; k < DIM; ++k)
-            sum += p[k] - p[k];
-        return sum == 0;
-    }
+    JFRNN_FUNCTION int row_of(int met) { return 32 - __clz(met & (MET_NOT_FINITE - 1)); }
     // A point, near the box: one that is far away is moved by multiples of 256 vectors, exactly (jfrnn/_geometry/far.py).
     JFRNN_MEMBER void take(long long i, real* p) const {
-        constexpr real MOST_STEPS = DOUBLE ? 1 << 22 : 1 << 11;
         for (int k = 0; k < DIM; ++k) {
             p[k] = now[DIM * i + k];
             if (!PERIODIC || !lattice.periodic(k))
                 continue;
-            const real units = p[k] * lattice.transform(k, k), steps = rint(units / STEP);
-            if (fabs(units) < FAR || !(fabs(steps) <= MOST_STEPS) || steps == 0)
+            const real units = p[k] * lattice.transform(k, k), steps = rint(units / FAR_STEP);
+            if (fabs(units) < FAR || !(fabs(steps) <= FAR_MOST) || steps == 0)
                 continue;
-            const real length = lattice.vector(k, k), high = half_of(length), low = length - high, turns = steps * STEP;
+            const real length = lattice.vector(k, k), high = half_of(length), low = length - high, turns = steps * FAR_STEP;
             p[k] = Lattice::add(Lattice::add(p[k], -Lattice::mul(turns, high)), -Lattice::mul(turns, low));
         }
     }
@@ -160,7 +153,7 @@ private:
         real point[3], difference[3], turns[3] = {0, 0, 0}, most = 0, square = 0;
         const real* before = reference + DIM * i;
         take(i, point);
-        if (!is_finite(point) && !is_finite(before))
+        if (!finite_point(point) && !finite_point(before))
             return false;
         bool sure = true, turned = false;
         for (int k = 0; k < DIM; ++k) {
@@ -195,12 +188,12 @@ private:
             packed |= (whole_turns + 512) << (10 * k);
             met |= whole_turns < 0 ? -whole_turns : whole_turns;
         }
-        if (!is_finite(p)) {
+        if (!finite_point(p)) {
             packed = -1;
-            met = NOT_FINITE;
+            met = MET_NOT_FINITE;
         } else if (!near) {
             packed = -2;
-            met = TOO_FAR;
+            met = MET_TOO_FAR;
         }
         real* row = positions + ROW * i;
         for (int k = 0; k < DIM; ++k)

@@ -13,13 +13,12 @@ import pytest
 import jfrnn
 from jfrnn._engine import prepare_search
 from jfrnn._engine.operands import pack_particles
-from jfrnn._engine.renew_warp import numbers_of_box
+from jfrnn._engine.renew_warp import constants_of, numbers_of_box
 from jfrnn._geometry import Status, make_cutoff
 from jfrnn._search import neighbor_list
 from jfrnn.kernels import Program, _compile, renew
 
 SKIN, CUTOFF, LENGTH = 0.3, 1.0, 10.0
-BITS = Status.NONFINITE.value, Status.OUT_OF_RANGE.value, Status.BOX_TOO_SMALL.value
 KINDS = [(3, np.float32, True), (2, np.float64, True), (3, np.float64, False)]
 ONE_THREAD = """
 #define __shared__ static
@@ -44,7 +43,7 @@ class OneThread:
 
     def __init__(self, dim, dtype, boxed, now, before):
         n = len(now)
-        kernels = renew.renew_kernels(dim, dtype is np.float64, boxed, True, BITS)
+        kernels = renew.renew_kernels(dim, dtype is np.float64, boxed, True, constants_of(dtype is np.float64))
         self.kernels = {name: self._on_the_cpu(kernel) for name, kernel in zip(kernels._fields, kernels, strict=True)}
         self.box = jfrnn.Box(np.full(dim, LENGTH, dtype)) if boxed else None
         made = jfrnn.search(jnp.asarray(now), CUTOFF, skin=SKIN, box=self.box, backend="jax", capacity=8)
@@ -151,7 +150,7 @@ def test_a_search_is_given_what_another_one_is(dim, dtype, boxed, spread):
 def test_kernels_compile_for_a_gpu(dim, dtype, boxed):
     launched.load_warp()
     for ordered in (False, True):
-        check = renew.renew_kernels(dim, dtype is np.float64, boxed, ordered, BITS).check
+        check = renew.renew_kernels(dim, dtype is np.float64, boxed, ordered, constants_of(dtype is np.float64)).check
         assert ".entry Renew_keep(" in _compile.find_binary(check.program, arch=90).read_text()
 
 
