@@ -6,7 +6,7 @@ misses or has too many. jax-md has to be installed.
 
 import csv
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from fractions import Fraction
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -83,15 +83,14 @@ def rows() -> list[tuple[Any, ...]]:
     return found
 
 
-def main(words: list[str]) -> None:
-    """Print the rows, and write them where that is asked for."""
-    made = rows()
-    for row in (COLUMNS, *made):
+def tell(columns: Sequence[str], made: Sequence[tuple[Any, ...]], words: list[str]) -> None:
+    """Print rows below their columns, and write them to the file that is named, if one is."""
+    for row in (columns, *made):
         print(*row, sep=", ")
     if words:
         with Path(words[0]).open("w", newline="") as file:
-            csv.writer(file).writerows((COLUMNS, *made))
+            csv.writer(file).writerows((columns, *made))
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    tell(COLUMNS, rows(), sys.argv[1:])
