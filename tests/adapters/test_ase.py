@@ -20,6 +20,7 @@ from jfrnn.ase import neighbor_list, primitive_neighbor_list
 from jfrnn.cases.periodic import PERIODIC_CASES
 
 ROOT = Path(__file__).parents[2]
+pytestmark = pytest.mark.filterwarnings("ignore:Setting the shape on a NumPy array:DeprecationWarning:ase")  # in ASE 3.29 itself
 
 
 def as_set(i, j, s):
