@@ -23,7 +23,7 @@ def kind_of(folder: Path) -> tuple[Any, str]:
     for known, module, name, table in _KINDS:
         if known <= columns:
             return getattr(import_module(f"experiments.{module}"), name), f"experiments.{table}"
-    return (dict, "experiments.gpu.report") if "kind" in columns else (SearchRow, "experiments._report")
+    return (dict, "experiments.bench.table") if "kind" in columns else (SearchRow, "experiments._report")
 
 
 def report(folder: Path) -> None:
@@ -33,7 +33,7 @@ def report(folder: Path) -> None:
     if kind is SearchRow:
         table(folder)
     else:
-        typer.echo(table(folder) if kind is dict else table(RowFile(folder, kind).read(), folder))
+        typer.echo(table(RowFile(folder, kind).read(), folder))
 
 
 def _columns(path: Path) -> set[str]:
