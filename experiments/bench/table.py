@@ -93,7 +93,12 @@ def judge(row: Line, way: Way, scene: Any, compiled: Callable[[Any], Callable[[]
 
 
 def fill_parts(
-    folder: Path, parts: Iterable[Part], given: object, about: Line, describe: Callable[[Line], str | None] = lambda row: None
+    folder: Path,
+    parts: Iterable[Part],
+    given: object,
+    about: Line,
+    describe: Callable[[Line], str | None] = lambda row: None,
+    retry_failed: bool = False,
 ) -> list[Line]:
     """Measure what the folder does not hold yet, and return the rows of all parts.
 
@@ -103,6 +108,7 @@ def fill_parts(
         given: What else decides what is measured: with another value, all is measured.
         about: What else rows say of where they were measured.
         describe: Returns a row as a line for the reader, or None.
+        retry_failed: Whether parts whose last row is of something missing or failed are measured again.
     """
     import jax
 
@@ -111,7 +117,7 @@ def fill_parts(
         key = digest([label, given])
         tasks.append(Task((key,), label, lambda _, key=key, rows=rows: in_parts(key, rows())))
     about |= {"device": jax.devices()[0].device_kind}
-    return fill(RowFile(take_folder(folder), dict), tasks, describe, about=about)
+    return fill(RowFile(take_folder(folder), dict), tasks, describe, about=about, retry_failed=retry_failed)
 
 
 def measure(folder: Path, name: str, parts: Iterable[Part], given: object, columns: Sequence[str]) -> pd.DataFrame:
