@@ -10,14 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
+from by_numpy import add_up, in_order
+from marked import assert_marks, marks
 from test_pair_sum import (
     CUTOFF,
     HARD,
     LENGTH,
     SLOW,
     N,
-    add_rows,
-    arrays_of,
     assert_same,
     everything,
     oracle,
@@ -68,32 +68,10 @@ def test_integers_travel_whose_bits_are_no_usual_floats(box):
 
     found = jax.jit(lambda x, kinds: fused(same, x, 0.3, kinds, box=box))(x, kinds)
     pairs = reference.reference_images(x, 0.3, matrix=np.ones(3), periodic=(box is not None,) * 3)
-    i, j, _ = arrays_of(pairs, 3)
+    i, j, _ = in_order(pairs, 3)
     expected = [np.bincount(i[kinds[j] == k], minlength=300) for k in bits]
     assert all(total.sum() > 1000 for total in expected)
     np.testing.assert_array_equal(np.stack(found), np.stack(expected))
-
-
-def marks(r, i, j):
-    """Tell pairs apart by whole numbers, which no order of summation rounds, and by the displacement."""
-    return {"count": 1.0, "ids": j, "rests": (j * j) % 61, "rows": i, "r": r}
-
-
-def assert_marks(found, pairs, x, q=None):
-    q = x if q is None else q
-    i, j, _ = arrays_of(pairs, x.shape[1])
-    (m, d), eps = q.shape, np.finfo(x.dtype).eps
-    counts, r = np.bincount(i, minlength=m), x.astype(np.float64)[j] - q.astype(np.float64)[i]
-    found = checked.with_sums(found, q)
-    np.testing.assert_array_equal(found["count"], counts)
-    np.testing.assert_array_equal(found["ids"], np.bincount(i, j, m))
-    np.testing.assert_array_equal(found["rests"], np.bincount(i, j * j % 61, m))
-    np.testing.assert_array_equal(found["rows"], counts * np.arange(m))
-    for k in range(d):
-        with np.errstate(over="ignore"):
-            error, total = np.abs(found["r"][:, k] - np.bincount(i, r[:, k], m)), np.bincount(i, np.abs(r[:, k]), m)
-        bounded = total < np.finfo(x.dtype).max / 4
-        assert (error <= 4 * eps * np.sqrt(counts) * total)[bounded].all()
 
 
 def marked(x, cutoff, queries=None, **options):
@@ -226,14 +204,14 @@ def test_values_of_all_kinds(dtype):
     values |= {"kind": jnp.asarray(random.integers(-5, 5, 400), np.int32), "heavy": jnp.asarray(random.random(400) < 0.5)}
     fn = functools.partial(of_all_kinds, jnp.asarray(1.5, dtype))
     found = fused(fn, x, 0.3, values)
-    i, j, _ = arrays_of(reference.reference_pairs(x, 0.3), 3)
+    i, j, _ = in_order(reference.reference_pairs(x, 0.3), 3)
     points, matrix, vector, kind, truth = (
         np.asarray(a).astype(dtype) for a in (x, *map(values.get, ("matrix", "vector", "kind", "heavy")))
     )
     r, whole = points[j] - points[i], np.where(truth[j] > 0, kind[j] - 2 * kind[i], 3)
     terms = {"outer": r[:, :, None] * vector[j][:, None], "rest": [1.5 * whole, np.maximum(r, 0)]}
     terms["turned"] = np.einsum("pab,pb->pa", matrix[j], vector[i] - vector[j])
-    assert_same(found, jax.tree.map(lambda t: add_rows(i, t, 400).astype(dtype), terms), 100 * np.finfo(dtype).eps)
+    assert_same(found, jax.tree.map(lambda t: add_up(t, i, 400).astype(dtype), terms), 100 * np.finfo(dtype).eps)
     again = jax.jit(lambda x: fused(fn, x, 0.3, values))(x)
     jax.tree.map(np.testing.assert_array_equal, found, again)
 
@@ -428,7 +406,7 @@ def test_tables_are_read_by_species():
         return sums.sum(), sums
 
     found = jax.jit(jax.grad(energy, (0, 1), has_aux=True))(x, table)
-    i, j, _ = arrays_of(reference.reference_pairs(x, 0.3), 3)
+    i, j, _ = in_order(reference.reference_pairs(x, 0.3), 3)
     r, factor = x[j] - x[i], (table[kind[i], kind[j]] + table[kind[j], kind[i]])[:, None]
     by_table = np.bincount(3 * (kind[i] % 3) + kind[j] % 3, (r**2).sum(1), 9).reshape(3, 3)
     by_place = np.zeros_like(x)

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
+from marked import assert_marks, marks
 from test_pair_sum import SLOW, N, assert_same, everything, oracle, scene, smooth, smooth_slopes, tangents_of
-from test_pair_sum_warp_boxes import assert_marks, marks
 from test_radii import LENGTH, radii_of
 
 import jfrnn
@@ -37,8 +37,7 @@ def assert_case(name, dtype, dim, rule, **options):
     found = fused(marks, x, radii, ids, radius_rule=rule, **more) if more else open_marks(x, radii, ids, rule)
     kind = {"queries": given.queries, "query_radii": given.query_cutoffs, "lengths": given.lengths}
     pairs = reference.reference_radii(given.positions, given.cutoffs, rule, **kind, **options)
-    lengths = np.zeros(dim) if given.lengths is None else given.lengths
-    assert_marks(found, pairs, given.positions, given.positions if given.queries is None else given.queries, lengths)
+    assert_marks(found, pairs, given.positions, given.queries, given.lengths)
     return len(pairs)
 
 
