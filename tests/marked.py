@@ -1,4 +1,6 @@
-"""Sums that tell pairs apart: whole numbers, which no order of summation rounds, and displacements."""
+"""Sums that tell pairs apart: whole numbers, which no order of summation rounds, and displacements; and sums that nearly cancel."""
+
+import math
 
 import checked
 import numpy as np
@@ -39,3 +41,22 @@ def assert_marks(found, pairs, x, q=None, matrix=None):
             allowed = np.bincount(i, each, m) + 4 * eps * np.sqrt(counts) * total
             bounded = total < np.finfo(found["r"].dtype).max / 4
             assert (np.abs(sums - np.bincount(i, term, m)) <= allowed)[bounded].all(), name
+
+
+def cancelling(n):
+    """Return n numbers in float32, over eight powers of ten, whose sum is a small part of them."""
+    random = np.random.default_rng(0)
+    values = (random.standard_normal(n) * 10 ** random.uniform(-3, 5, n)).astype(np.float32)
+    values[n // 2 :] = -values[: n // 2] * np.float32(1 + 1e-5)
+    return values
+
+
+def assert_compensated(plain, compensated, values, times=1, worse=10):
+    """Compare sums of all values, each so many times, with exact ones: compensated sums have a far smaller bound."""
+    eps, n = np.finfo(np.float32).eps, len(values)
+    exact, total = times * math.fsum(values.tolist()), times * math.fsum(np.abs(values).tolist())
+    off, left = (np.abs(np.asarray(found, np.float64) - exact).max() for found in (plain, compensated))
+    bound = 2 * eps * abs(exact) + 4 * eps**2 * n * total
+    assert off <= 4 * eps * math.sqrt(n * times) * total
+    assert left <= bound
+    assert off > worse * bound  # else this would prove nothing

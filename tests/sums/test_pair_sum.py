@@ -1,7 +1,6 @@
 """`pair_sum`: the pairs of the oracle, summed; its derivatives against those of the oracle's sum; and what must not matter."""
 
 import functools
-import math
 from itertools import product
 
 import checked
@@ -11,7 +10,7 @@ import numpy as np
 import pytest
 import reference
 from by_numpy import add_up, in_order
-from marked import assert_marks
+from marked import assert_compensated, assert_marks, cancelling
 
 import jfrnn
 from jfrnn._engine import tuning as _tuning
@@ -601,60 +600,38 @@ def test_of_equal_extremes_array_programs_choose_likewise():
 @pytest.mark.parametrize("backend", ["list", pytest.param("jax", marks=SLOW), pytest.param("brute", marks=SLOW)])
 def test_rounding(backend):
     """Sums of many terms against exact ones: the bound of the docstring, and with compensation a far smaller one."""
-    n, eps = 500, np.finfo(np.float32).eps
-    random = np.random.default_rng(0)
-    values = (random.standard_normal(n) * 10 ** random.uniform(-3, 5, n)).astype(np.float32)
-    values[n // 2 :] = -values[: n // 2] * np.float32(1 + 1e-5)
-    x = np.zeros((n, 2), np.float32)
+    values, x = cancelling(500), np.zeros((500, 2), np.float32)
     options = {"backend": backend}
     if backend == "list":
         options = {"neighbors": jfrnn.search(x, 1.0, include_self=True, backend="warp")}
     else:
         options["include_self"] = True
-    plain, compensated = (
-        np.asarray(jfrnn.pair_sum(lambda r, i, j: j, x, 1.0, values, compensated=c, **options), np.float64) for c in (False, True)
-    )
-    exact, total = math.fsum(values.tolist()), math.fsum(np.abs(values).tolist())
-    assert np.abs(plain - exact).max() <= 4 * eps * math.sqrt(n) * total
-    bound = 2 * eps * abs(exact) + 4 * eps**2 * n * total
-    assert np.abs(compensated - exact).max() <= bound
-    assert np.abs(plain - exact).max() > 10 * bound  # else this would prove nothing
+    both = (jfrnn.pair_sum(lambda r, i, j: j, x, 1.0, values, compensated=c, **options) for c in (False, True))
+    assert_compensated(*both, values)
 
 
 def test_derivatives_of_compensated_sums_are_compensated():
     """Those by the factors of i are the sums of the others, in which almost all cancels."""
-    n, eps, random = 500, np.finfo(np.float32).eps, np.random.default_rng(0)
-    values = (random.standard_normal(n) * 10 ** random.uniform(-3, 5, n)).astype(np.float32)
-    values[n // 2 :] = -values[: n // 2] * np.float32(1 + 1e-5)
-    x, ones = np.zeros((n, 2), np.float32), np.ones(3, np.float32)
+    values, x = cancelling(500), np.zeros((500, 2), np.float32)
 
     def slopes(compensated):
         given = {"queries": x[:3], "compensated": compensated, "backend": "warp"}
         total = lambda w: jfrnn.pair_sum(lambda r, i, j: i * j, x, 1.0, values, query_values=w, **given).sum()  # noqa: E731
-        return np.asarray(jax.jit(jax.grad(total))(ones), np.float64)
+        return jax.jit(jax.grad(total))(np.ones(3, np.float32))
 
-    exact, total = math.fsum(values.tolist()), math.fsum(np.abs(values).tolist())
-    bound = 2 * eps * abs(exact) + 4 * eps**2 * n * total
-    assert np.abs(slopes(True) - exact).max() <= bound
-    assert np.abs(slopes(False) - exact).max() > 10 * bound  # else this would prove nothing
+    assert_compensated(slopes(False), slopes(True), values)
 
 
 def test_derivatives_by_what_all_pairs_share_are_compensated():
     """They are one sum over all pairs, which kernels add in parts: what these lost to rounding is not lost again."""
-    n, eps, random = 500, np.finfo(np.float32).eps, np.random.default_rng(0)
-    values = (random.standard_normal(n) * 10 ** random.uniform(-3, 5, n)).astype(np.float32)
-    values[n // 2 :] = -values[: n // 2] * np.float32(1 + 1e-5)
-    x = np.zeros((n, 2), np.float32)
+    values, x = cancelling(500), np.zeros((500, 2), np.float32)
 
     def slope(compensated):
         given = {"include_self": True, "compensated": compensated, "backend": "warp"}
         total = lambda c: jfrnn.pair_sum(lambda r, i, j: c * j, x, 1.0, values, **given).sum()  # noqa: E731
-        return float(jax.jit(jax.grad(total))(np.float32(1)))
+        return jax.jit(jax.grad(total))(np.float32(1))
 
-    exact, size = n * math.fsum(values.tolist()), n * math.fsum(np.abs(values).tolist())
-    bound = 2 * eps * abs(exact) + 4 * eps**2 * n * size  # n is the root of the number of pairs
-    assert abs(slope(True) - exact) <= bound
-    assert abs(slope(False) - exact) > 10 * bound  # else this would prove nothing
+    assert_compensated(slope(False), slope(True), values, times=500)
 
 
 # --- transformations, memory, errors -----------------------------------------------------------------------------------------
