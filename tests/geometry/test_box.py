@@ -307,12 +307,7 @@ def test_gradients_in_positions_and_box(vectors):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("backend", "vectors"),
-    [
-        ("warp", LENGTHS),
-        ("warp", SKEWED),
-        ("warp", SMALL),
-        ("jax", LENGTHS),
-    ],
+    [("warp", LENGTHS), ("warp", SKEWED), ("warp", SMALL), ("jax", LENGTHS)],
     ids=["warp-lengths", "warp-skewed", "warp-images", "jax-lengths"],
 )
 def test_skin_in_a_moving_box(backend, vectors):

@@ -134,8 +134,7 @@ def test_periodic_cases(backend, dtype, dim):
 
 
 @pytest.mark.parametrize(
-    ("backend", "rule"),
-    [pytest.param("jax", rule, marks=SLOW) for rule in ("mean", "gather", "scatter", "either", "both")],
+    ("backend", "rule"), [pytest.param("jax", rule, marks=SLOW) for rule in ("mean", "gather", "scatter", "either", "both")]
 )
 def test_radii(backend, rule):
     for name in ("ties", "spread_100"):

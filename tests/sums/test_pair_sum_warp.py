@@ -369,11 +369,7 @@ def with_strange_slope(r, i, j):
         (_translate.NoTranslationError, "the primitive 'sort' has no translation", lambda: fused(sorted_norm, X, 1.0)),
         (_translate.NoTranslationError, "the primitive 'sort'", lambda: derivative_without_translation(jnp.asarray(X))),
         (TypeError, "fn returns int32: convert it, or pass backend='jax'", lambda: fused(lambda r, i, j: jnp.int32(1), X, 1.0)),
-        (
-            TypeError,
-            "values of bool, float32, int32, fn gets or closes over float64",
-            lambda: fused(second, X, 1.0, np.ones(4)),
-        ),
+        (TypeError, "values of bool, float32, int32, fn gets or closes over float64", lambda: fused(second, X, 1.0, np.ones(4))),
     ],
 )
 def test_errors(error, match, call):

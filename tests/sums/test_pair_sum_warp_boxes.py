@@ -9,19 +9,7 @@ import numpy as np
 import pytest
 import reference
 from marked import assert_marks, marks
-from test_pair_sum import (
-    CUTOFF,
-    SLOW,
-    N,
-    assert_same,
-    everything,
-    moved,
-    oracle,
-    scene,
-    smooth,
-    smooth_slopes,
-    tangents_of,
-)
+from test_pair_sum import CUTOFF, SLOW, N, assert_same, everything, moved, oracle, scene, smooth, smooth_slopes, tangents_of
 
 import jfrnn
 from jfrnn.cases.batches import BATCH_CASES
