@@ -8,8 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
+from by_numpy import in_order
 from checked import padded
-from test_box import LONG, arrays_of, energy_and_slopes, masked_images, unpacked
+from test_box import LONG, energy_and_slopes, masked_images, unpacked
 
 import jfrnn
 from jfrnn.cases.crystals import CRYSTAL_CASES
@@ -164,7 +165,7 @@ def test_skin_in_moving_boxes(backend):
 def test_derivatives_in_positions_and_boxes(ways):
     """Sums over the pairs of the oracle, and their derivatives."""
     x, batch, boxes = crystals()
-    pairs = arrays_of(expected_images("mixed", np.float64, 2))
+    pairs = in_order(expected_images("mixed", np.float64, 2), 2)
     total, capacity = len(pairs[0]), CAPACITY[2]
     nbrs = jfrnn.search(x, 0.75, box=jfrnn.Box(boxes), batch=batch, backend="warp", capacity=capacity)
 

@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
-from test_box import arrays_of, masked_images, pull_back
+from by_numpy import in_order
+from test_box import masked_images, pull_back
 from test_boxes import box_of, listed_images, system_by_system
 
 import jfrnn
@@ -160,7 +161,7 @@ def test_sums_and_derivatives_in_positions_and_boxes(who, backend, way):
     """Sums over the oracle's pairs, their gradient, and with a table that of its norm, by a complex step."""
     given = scene("mixed", np.float64, 2, who)
     x, boxes, batch, m = given.x, given.given.boxes, given.batch, np.random.default_rng(4).uniform(0, 1, len(given.x))
-    i, j, shifts = pairs = arrays_of(given.pairs())
+    i, j, shifts = pairs = in_order(given.pairs(), 2)
     reach, weights = box_of(given.given).images_for(float(np.max(given.cutoff))), np.arange(1.0, len(x) + 1)
     nbrs = given.search(backend, capacity=CAPACITY[2]) if way == "list" else None
 
