@@ -173,8 +173,7 @@ def test_circles_are_found():
 
 
 @pytest.mark.parametrize(
-    ("folder", "name"),
-    [("jfrnn", "jfrnn"), ("kernels", "jfrnn.kernels"), ("cases", "jfrnn.cases"), ("experiments", "experiments")],
+    ("folder", "name"), [("jfrnn", "jfrnn"), ("kernels", "jfrnn.kernels"), ("cases", "jfrnn.cases"), ("experiments", "experiments")]
 )
 def test_no_circles(folder, name):
     """No module imports itself by way of others, wherever in its text the imports stand."""

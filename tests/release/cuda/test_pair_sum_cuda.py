@@ -116,8 +116,7 @@ def test_terms_in_boxes_compile(dim, dtype, length):
 
 
 @pytest.mark.parametrize(
-    ("dtype", "variant"),
-    [pytest.param(np.float32, {}, marks=pytest.mark.slow), (np.float64, {"periodic": 2, "batched": True})],
+    ("dtype", "variant"), [pytest.param(np.float32, {}, marks=pytest.mark.slow), (np.float64, {"periodic": 2, "batched": True})]
 )
 def test_extremes_compile(dtype, variant):
     masses, x, _, _ = arguments(dtype, 3)
@@ -204,10 +203,7 @@ def test_programs_for_cuda_call_it_and_plans_have_the_arguments_of_their_kernels
     assert (len(sorting.steps), len(summing.steps)) == (6, 2 + periodic)
     assert [step.beside for step in summing.steps] == [False] * (1 + periodic) + [bool(periodic)]
     words = {"info", "scratch"}
-    for found, arrays in (
-        (sorting, {*warp_sums._GIVEN[:3], *words}),
-        (summing, {*given, *words, *warp_sums._RESULTS, "values"}),
-    ):
+    for found, arrays in ((sorting, {*warp_sums._GIVEN[:3], *words}), (summing, {*given, *words, *warp_sums._RESULTS, "values"})):
         for step in found.steps:
             numbers = {**found.numbers, **step.numbers}
             assert {field.name for field in step.kernel.fields if field.is_array} <= arrays | {*found.absent, *SPARED}
