@@ -110,8 +110,9 @@ def make_state(scene: FluidScene, dtype: type) -> State:
     """
     physics = scene.physics
     x, v = jnp.asarray(scene.positions, dtype), jnp.asarray(scene.velocities, dtype)
-    zero = jnp.zeros((), dtype)
-    state = State(x, v, zero, jnp.zeros_like(x), zero, solid=solids.begin(scene, x))
+    zero, solid = jnp.zeros((), dtype), solids.begin(scene, x)
+    solids.check_far(scene, x, solid)
+    state = State(x, v, zero, jnp.zeros_like(x), zero, solid=solid)
     if scene.outflow is not None:
         state = state._replace(gone=jnp.zeros(scene.n, bool))
     if physics.transport is not None or physics.shifting is not None:

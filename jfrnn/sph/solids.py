@@ -24,6 +24,7 @@ from jfrnn.cases import fluids
 from jfrnn.cases.fluids import FluidScene, Scene, Turning
 from jfrnn.sph import sight
 from jfrnn.sph.errors import SceneError
+from jfrnn.sph.inside import find_inside
 from jfrnn.sph.kernels import KERNELS, Kernel
 from jfrnn.sph.pairs import reach
 from jfrnn.sph.particles import Beside, Model, State, active
@@ -59,13 +60,7 @@ def begin(scene: FluidScene, x: Array, angle: Array | None = None) -> Beside | N
             "solid must be a closed mesh whose faces run counterclockwise as seen from the fluid: they run through one side more "
             "often one way than the other. If corners are written once per triangle, as in STL files, join them first."
         )
-    inside = np.asarray(signed.mask & (signed.distance < GAP / 2 * scene.spacing))
-    if scene.wall is not None:
-        inside = inside & ~scene.wall
-    if inside.any():
-        raise SceneError(
-            f"positions of the fluid must be outside the solid by {GAP / 2} spacings: particle {inside.argmax()} is not."
-        )
+    _refuse(scene, np.asarray(signed.mask & (signed.distance < GAP / 2 * scene.spacing)))
     corners = np.asarray(vertices)[solid.faces]
     asked = sight.points_to_ask(corners, cutoff)
     on_wall = jfrnn.search_triangles(asked[0], vertices, faces, cutoff)
@@ -78,6 +73,30 @@ def begin(scene: FluidScene, x: Array, angle: Array | None = None) -> Beside | N
         return seen
     neighbors = _neighbors(scene.spacing, cutoff, scene.dim)
     return _look_through(seen, at, sight.make_room(np.array([int(jnp.sum(tri.count > 0)), 0, 0]), neighbors, scene.n), neighbors)
+
+
+def _refuse(scene: FluidScene, inside: np.ndarray) -> None:
+    if scene.wall is not None:
+        inside = inside & ~scene.wall
+    if inside.any():
+        raise SceneError(
+            f"positions of the fluid must be outside the solid by {GAP / 2} spacings: particle {inside.argmax()} is not. If it "
+            "seems to be, the faces of the solid are inside out."
+        )
+
+
+def check_far(scene: FluidScene, x: Array, seen: Beside | None) -> None:
+    """Refuse a fluid that begins inside the solid, so deep that it sees no face: `begin` knows of those that do.
+
+    Raises:
+        SceneError: Names a particle.
+    """
+    if seen is None or scene.solid is None:
+        return
+    far, corners = ~np.asarray(seen.mask), np.asarray(scene.solid.vertices, np.float64)[scene.solid.faces]
+    inside = np.zeros(scene.n, bool)
+    inside[far] = find_inside(np.asarray(x, np.float64)[far], _reach(scene), corners)
+    _refuse(scene, inside)
 
 
 def _neighbors(spacing: float, cutoff: float, dim: int) -> float:
