@@ -133,7 +133,8 @@ def run(
             write.snapshot(s, nbrs, step)
             rate = f"{(step - step_before) / (perf_counter() - start):.0f} steps/s"
             start, step_before = perf_counter(), step
-            text = f"{scene.name}: t {line['time']:.4g} s, {rate}, energy {line['total']:.4g} J"
+            unit = "J" if scene.dim == len("xyz") else "J/m"
+            text = f"{scene.name}: t {line['time']:.4g} s, {rate}, energy {line['total']:.4g} {unit}"
             progress.advance(text + ("" if nbrs is None else f", {int(nbrs.rebuild_count)} rebuilds"))
         progress.end()
         if how.pictures:
