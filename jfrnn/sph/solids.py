@@ -28,6 +28,7 @@ from jfrnn.sph.inside import find_inside
 from jfrnn.sph.kernels import KERNELS, Kernel
 from jfrnn.sph.pairs import reach
 from jfrnn.sph.particles import Beside, Model, State, active
+from jfrnn.sph.viscosity import kinematic
 
 GAP = 0.2  # particle spacings: on a lattice, particles at a wall are half a spacing away
 _ROOM_AROUND = 2  # times the particles that are near a point in a fluid on a lattice
@@ -322,7 +323,8 @@ def push(model: Model, s: State, beside: Beside, rho: Array, p: Array) -> Array:
         along = along - jnp.sum(body * wall.normal, axis=1) * (wall.distance * wall.area + wall.weight)
     a = jnp.maximum(along, 0)[:, None] * wall.normal
     if physics.viscosity is not None and not physics.slip:
-        a = a - (2 * physics.viscosity * wall.area / jnp.maximum(wall.distance, model.spacing / 2))[:, None] * wall.slip
+        drag = 2 * kinematic(physics.viscosity_form, physics.viscosity, rho) * wall.area
+        a = a - (drag / jnp.maximum(wall.distance, model.spacing / 2))[:, None] * wall.slip
     return a
 
 
@@ -333,10 +335,10 @@ def load(model: Model, s: State, beside: Beside, rho: Array, p: Array) -> tuple[
     which a Laplacian needs the first only. The second changes neither the flow nor the force on a solid that is wet all around, but
     takes 2μω times its volume off the torque, as in a fluid that turns with it and does nothing to it.
     """
-    wall, onto = _find_acting(model, s, beside), -push(model, s, beside, rho, p)
-    if model.turning is not None and model.physics.viscosity is not None and not model.physics.slip:
+    physics, wall, onto = model.physics, _find_acting(model, s, beside), -push(model, s, beside, rho, p)
+    if model.turning is not None and physics.viscosity is not None and not physics.slip:
         spin = model.turning.rate * _across(wall.normal, model.turning)
-        onto = onto - (2 * model.physics.viscosity * wall.area)[:, None] * spin
+        onto = onto - (2 * kinematic(physics.viscosity_form, physics.viscosity, rho) * wall.area)[:, None] * spin
     return onto, s.x - wall.distance[:, None] * wall.normal
 
 

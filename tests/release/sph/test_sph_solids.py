@@ -96,6 +96,26 @@ def test_frames_turn_back(dim):
     np.testing.assert_allclose(solids.into_frame(jnp.asarray(moved), there, 0.7 * 3.0), x, atol=1e-14)
 
 
+def test_a_wall_drags_by_the_dynamic_viscosity_of_the_source():
+    """μ = ρν of "source" and ν of "morris" are the same fluid, and do the same to a wall that turns."""
+    square = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+    sides = np.stack([np.arange(4), (np.arange(4) + 1) % 4], axis=1)
+    solid = fluids.Solid(square, sides, fluids.Turning((0.0, 0.0), None, 2.0))
+    x, rho, found = np.array([[1.07, 0.2], [0.3, 1.1]]), jnp.asarray([800.0, 1100.0]), []
+    for form, viscosity in (("morris", 1.0), ("source", 1000.0)):
+        scene = beside(solid, x, velocities=0.3 * x, density=1000.0, viscosity=viscosity, viscosity_form=form)
+        model, s = make_model(scene), make_state(scene)
+        onto, _ = solids.load(model, s, s.solid, rho, 0 * rho)
+        found.append(np.asarray(onto) * (1 if form == "morris" else np.asarray(rho)[:, None] / 1000.0))
+        step = float(solver.courant(model, s._replace(v=0 * s.v, solid=None)))
+        assert step == pytest.approx(0.125 * 0.15**2 / 1.0)
+    np.testing.assert_allclose(*found, rtol=1e-6)
+    assert np.abs(found[0]).max() > 1.0
+    ball = beside(None, np.zeros((1, 3)), viscosity=1.0, viscosity_form="source")
+    with pytest.raises(SceneError, match="pressure and viscosity_form 'source' are forms in 2D"):
+        make_model(ball)
+
+
 SHARP = meshes.gear(6, 200, 1.0, 2.0, 3.0)
 
 
