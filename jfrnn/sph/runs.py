@@ -252,7 +252,7 @@ class _Writer:
             there = snapshots.are_there(scene, s)
             frames.draw(scene, there, x, v, time, float(top), self._folder / "frames" / f"{step:09d}.png")
         snapshots.save(s, scene, np.asarray(rho), np.asarray(p), self._folder / "snapshots", step)
-        snapshots.add_to_series(self._folder / f"{scene.name}.pvd", float(s.time), step)
+        snapshots.add_to_series(self._folder / f"{scene.name}.pvd", self._line["time"], step)
         self.series(step)
 
     def series(self, step: int) -> None:

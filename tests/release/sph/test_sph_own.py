@@ -82,7 +82,7 @@ def test_probes_of_a_lattice():
 
 
 def test_a_run_goes_on_for_longer_and_writes_a_table(tmp_path):
-    short, longer = sph.How(frames=1, lines=2, pictures=False), sph.How(frames=2, lines=2, pictures=False)
+    short, longer = (sph.How(frames=frames, lines=2, pictures=False, dtype="float32") for frames in (1, 2))
     scene, probes = replace(FREE, duration=0.1), {"own": lambda model, s: {"far": s.x[1], "time": s.time}}
     sph.run(scene, tmp_path / "a", short, probes=probes)
     sph.run(replace(scene, duration=0.2), tmp_path / "a", longer, probes=probes)
@@ -92,6 +92,8 @@ def test_a_run_goes_on_for_longer_and_writes_a_table(tmp_path):
     table = read_table(tmp_path / "a" / "probes.csv")
     assert tuple(table) == ("step", "time", "own_far_0", "own_far_1", "own_time")
     np.testing.assert_allclose(table["own_time"], [0, 0.05, 0.1, 0.15, 0.2])
+    np.testing.assert_array_equal(table["time"], [0, 0.05, 0.1, 0.15, 0.2])  # what 0.05 of float32 is called, too
+    assert 'timestep="0.1"' in (tmp_path / "a" / "free.pvd").read_text()
     assert json.loads((tmp_path / "a" / "run.json").read_text())["duration"] == 0.2
     with pytest.raises(SceneError, match="holds a run with another duration, frames"):
         sph.run(replace(scene, duration=0.3), tmp_path / "a", short, probes=probes)
