@@ -100,6 +100,8 @@ def _check_particles(scene: FluidScene | GasScene) -> None:
             raise SceneError(f"{name} are not finite: that of particle {int(np.argwhere(~np.isfinite(array))[0][0])} is not.")
         if name in ("masses", "densities") and not (array > 0).all():
             raise SceneError(f"{name} must be above 0: particle {int(np.argmin(array))} has {array.min()}.")
+        if name == "energies" and not (array >= 0).all():
+            raise SceneError(f"energies must not be below 0: particle {int(np.argmin(array))} has {array.min()}.")
     if scene.wall is not None:
         if not isinstance(scene.wall, np.ndarray | jax.Array) or scene.wall.shape != (n,) or scene.wall.dtype != bool:
             raise SceneError(f"wall must be an array of shape [{n}], bool, or None, got {_kind(scene.wall)}.")

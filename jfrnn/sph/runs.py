@@ -19,7 +19,7 @@ from jfrnn.sph.interrupts import hold_interrupts
 from jfrnn.sph.model import choose_dtype, make_model, make_state
 from jfrnn.sph.pairs import Neighbors
 from jfrnn.sph.particles import Flow, Force, GasModel, State, active
-from jfrnn.sph.probes import Probe, columns
+from jfrnn.sph.probes import Probe, check_names, columns
 from jfrnn.sph.progress import Progress
 
 
@@ -52,6 +52,7 @@ class How:
             SceneError: Names the field.
         """
         kinds = {"frames": int, "lines": int, "skin": float, "neighbors": Literal["auto", "pair_sum", "list"]}
+        kinds |= {"pictures": bool, "hdf": bool}
         bounds = {"frames": ranges.MANY, "lines": ranges.MANY, "skin": ranges.SKIN}
         for name, kind in kinds.items():
             value = getattr(self, name)
@@ -104,6 +105,7 @@ def run(
         KeyboardInterrupt: Ctrl-C came.
     """
     folder, dtype = Path(folder), choose_dtype(how.dtype)
+    check_names(probes or {})
     if how.hdf:
         series.check_library()
     with hold_interrupts() as stopped:

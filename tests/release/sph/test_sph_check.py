@@ -102,6 +102,14 @@ def test_a_mistake_in_a_scene_is_named(change, message):
             act(replace(SCENE, **change))
 
 
+def test_thermal_energies_are_not_below_0():
+    about = {name: getattr(SCENE, name) for name in ("name", "positions", "velocities", "masses", "spacing", "duration", "step")}
+    gas = fluids.GasScene(**about, energies=np.arange(5.0), physics=fluids.Gas(1.4, 1.3))
+    check_scene(gas)
+    with pytest.raises(SceneError, match=r"energies must not be below 0: particle 0 has -1\.0"):
+        check_scene(replace(gas, energies=gas.energies - 1))
+
+
 def test_what_is_no_scene_is_refused():
     with pytest.raises(SceneError, match="scene must be a FluidScene or a GasScene, got an array"):
         make_model(POSITIONS)

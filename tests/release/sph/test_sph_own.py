@@ -81,6 +81,35 @@ def test_probes_of_a_lattice():
         sph.pressure_at((0.5, 0.5))(model, s)
 
 
+@pytest.mark.parametrize(
+    ("probe", "message"),
+    [
+        (sph.flow_through((0.0, 0.0, 0.0), (1.0, 0.0), 0.1), r"point must be 2 finite numbers, got \(0.0, 0.0, 0.0\)"),
+        (sph.flow_through((0.0, 0.0), (0.0, 0.0), 0.1), r"normal and width must not be 0, got \(0.0, 0.0\) and 0.1"),
+        (sph.flow_through((0.0, 0.0), (1.0, 0.0), 0.0), "normal and width must not be 0"),
+        (sph.surface_height((0.1, 0.2), 0.1), r"place must be 1 finite numbers, got \(0.1, 0.2\)"),
+        (sph.force_on_walls((0.0, "a")), r"about must be 2 finite numbers, got \(0.0, 'a'\)"),
+    ],
+)
+def test_a_mistake_in_a_probe_is_named(probe, message):
+    with pytest.raises(SceneError, match=message):
+        probe(sph.make_model(FREE), sph.make_state(FREE))
+
+
+@pytest.mark.parametrize(
+    ("probes", "message"),
+    [
+        ([spring], "probes must be a dict of functions by name, got list"),
+        ({"a, b": spring}, "probes must be functions by names without a comma, got 'a, b'"),
+        ({"a": 1.0}, "probes must be functions by names without a comma, got 'a': 1.0"),
+    ],
+)
+def test_a_mistake_in_names_of_probes_is_named(tmp_path, probes, message):
+    with pytest.raises(SceneError, match=message):
+        sph.run(FREE, tmp_path / "out", sph.How(pictures=False), probes=probes)
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_run_goes_on_for_longer_and_writes_a_table(tmp_path):
     short, longer = (sph.How(frames=frames, lines=2, pictures=False, dtype="float32") for frames in (1, 2))
     scene, probes = replace(FREE, duration=0.1), {"own": lambda model, s: {"far": s.x[1], "time": s.time}}
@@ -190,6 +219,7 @@ def test_all_snapshots_go_into_one_file_that_paraview_reads(tmp_path, monkeypatc
         ({"frames": "few"}, "frames: got 'few'; input should be a valid integer"),
         ({"skin": -1.0}, "skin: got -1.0; input should be greater than or equal to 0.01"),
         ({"neighbors": "verlet"}, "neighbors: got 'verlet'; input should be 'auto', 'pair_sum' or 'list'"),
+        ({"pictures": "some"}, "pictures: got 'some'; input should be a valid boolean"),
     ],
 )
 def test_a_mistake_in_how_a_scene_is_run_is_named(told, message):
