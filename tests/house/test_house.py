@@ -36,6 +36,7 @@ WHERE_NEEDED = {  # third-party modules that single files import where they are 
     "sph/ranges.py": {"pydantic"},
     "sph/toml_scenes.py": {"pydantic", "trimesh"},
     "sph/files.py": {"trimesh"},
+    "sph/inside.py": {"scipy"},
     "sph/series.py": {"h5py", "pyvista"},
     "sph/snapshots.py": {"pyvista"},
 }
