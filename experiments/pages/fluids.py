@@ -14,8 +14,8 @@ def blast() -> str:
 
 
 def _beside_answers(rows: list[dict[str, str]]) -> str:
-    heads = ("case", "what is measured", ">measured", "target", "met", ">particles", ">steps", ">seconds")
-    names = ("case", "quantity", "measured", "target", "met", "particles", "steps", "seconds")
+    heads = ("case", "what is measured", ">measured", "target", "met", ">particles", ">steps", ">seconds", "on")
+    names = ("case", "quantity", "measured", "target", "met", "particles", "steps", "seconds", "device")
     return markdown(heads, ([row[name] for name in names] for row in rows))
 
 

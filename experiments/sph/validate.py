@@ -67,6 +67,7 @@ def measure(name: str, case: Case, say: Any = print) -> CaseRow:  # noqa: ANN401
         say(f"{name} · t {float(s.time):.4g} s · {step / (perf_counter() - start):.0f} steps/s")
     figures, curves = _judge(case, scene, seen) if reason is None else ([], {})
     about = {"particles": scene.n, "steps": step, "seconds": round(perf_counter() - start, 1), "axes": case.axes}
+    about["device"] = jax.devices()[0].device_kind
     return CaseRow(key=name, status="ok" if figures else "failed", reason=reason, figures=figures, curves=curves, **about)
 
 
@@ -90,7 +91,7 @@ def table(rows: list[CaseRow]) -> pd.DataFrame:
     """Return a line per figure, and one for each case that has none."""
     lines = []
     for row in rows:
-        run_line = {"particles": row.particles, "steps": row.steps, "seconds": row.seconds}
+        run_line = {"particles": row.particles, "steps": row.steps, "seconds": row.seconds, "device": row.device or "cpu"}
         if not row.figures:
             lines.append({"case": row.key, "quantity": row.reason, "measured": "", "target": "", "met": "no"} | run_line)
         for figure in row.figures:
