@@ -25,6 +25,7 @@ napoleon_use_rtype = False
 napoleon_use_ivar = True
 napoleon_attr_annotations = False
 add_module_names = False
+toc_object_entries_show_parents = "hide"
 python_maximum_signature_line_length = 88
 myst_enable_extensions = ["colon_fence", "deflist"]
 myst_heading_anchors = 3
@@ -37,6 +38,7 @@ html_show_copyright = False
 html_show_sphinx = False
 html_static_path = ["_static"]
 html_css_files = ["pages.css"]
+html_js_files = ["pages.js"]
 
 HERE = Path(__file__).parent
 STUDIES = HERE.parent / "notebooks"
@@ -53,6 +55,7 @@ def setup(app):
     for notebook in STUDIES.glob("*.ipynb"):
         shutil.copyfile(notebook, HERE / "notebooks" / notebook.name)
     app.connect("source-read", objects.link)
+    app.connect("missing-reference", objects.explain)
     app.connect("autodoc-process-signature", objects.shorten)
     app.connect("autodoc-process-docstring", _escape, priority=100)  # before Napoleon
 

@@ -5,6 +5,7 @@ import inspect
 import re
 from pathlib import Path
 
+from sphinx.util.nodes import make_refnode
 from sphinx.util.typing import stringify_annotation
 
 from jfrnn._tracing import arguments
@@ -36,9 +37,11 @@ def write():
     made = {}
     for page in sorted(API.glob("*.md")):
         for module, name, directive in _objects(page.read_text(encoding="utf-8")):
-            title = name.rpartition(".")[2]
+            place, last = _place(module, name), name.rpartition(".")[2]
+            offered = hasattr(importlib.import_module(module), last)  # types of some results are not
+            title = place if offered else last
             text = f"# {title}\n\n```{{eval-rst}}\n.. currentmodule:: {module}\n{directive}```\n"
-            made[API / "objects" / f"{_place(module, name)}.md"] = text
+            made[API / "objects" / f"{place}.md"] = text
     (API / "objects").mkdir(exist_ok=True)
     for path in set((API / "objects").glob("*.md")) - set(made):
         path.unlink()
@@ -64,10 +67,18 @@ def link(app, docname, source):
             f"- [`{name.rpartition('.')[2]}`](objects/{place}.md): {_first(module, name)}"
             for place, name in items
         ]
-        tree = ["", "```{toctree}", ":hidden:", "", *(f"objects/{place}" for place, _ in items), "```"]
+        entries = [f"{name.rpartition('.')[2]} <objects/{place}>" for place, name in items]
+        tree = ["", "```{toctree}", ":hidden:", "", *entries, "```"]
         return "\n".join([*lines, *tree, ""]) if items else ""
 
     source[0] = _BLOCK.sub(listed, source[0])
+
+
+def explain(app, env, node, shown):
+    """Link the names of `shorten` to the table that says what each stands for."""
+    if node.get("reftarget") not in _ALIASES:
+        return None
+    return make_refnode(app.builder, node["refdoc"], "api/jfrnn", "what-arguments-may-be", shown)
 
 
 def _objects(text):

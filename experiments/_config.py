@@ -213,7 +213,7 @@ def narrow(config: Config, **asked: Any) -> Config:  # noqa: ANN401
     try:
         return Config.model_validate(config.model_dump() | asked | {"scenes": tables})
     except ValidationError as error:
-        raise UsageError("\n".join(_explain(item, Config) for item in error.errors())) from error
+        raise UsageError("\n".join(_tell(error, Config))) from error
 
 
 def digest(value: object) -> str:
@@ -237,11 +237,14 @@ def load(path: Path, kind: type[ConfigT] = Config) -> ConfigT:
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise UsageError(f"{path}: no valid TOML: {error}") from error
     except ValidationError as error:
-        items = error.errors()  # of a list whose only item is wrong, it also says that the list is empty
-        items = [
-            item for item in items if not any(item["loc"] == other["loc"][: len(item["loc"])] != other["loc"] for other in items)
-        ]
-        raise UsageError("\n".join(f"{path}: {_explain(item, kind)}" for item in items)) from error
+        raise UsageError("\n".join(f"{path}: {line}" for line in _tell(error, kind))) from error
+
+
+def _tell(error: ValidationError, kind: type[Table]) -> list[str]:
+    """Return a line for each key that is wrong."""
+    items = error.errors()  # of a list whose only item is wrong, it also says that the list is empty
+    items = [item for item in items if not any(item["loc"] == other["loc"][: len(item["loc"])] != other["loc"] for other in items)]
+    return [_explain(item, kind) for item in items]
 
 
 def _table_of(kind: type[BaseModel], location: Sequence[int | str]) -> type[BaseModel]:

@@ -193,7 +193,7 @@ def headline(found: dict[str, dict[str, float]], what: str, scenes: str = "scene
         beside: Whether most times were measured beside other work, or nobody knows: they tell then which method is first to nobody.
     """
     if beside and what == "fast":
-        return "Time of a search, measured beside other work or for too short to tell: who is first is not said"
+        return "Time of a search, measured beside other work or too briefly: who is first is not said"
     lists = {scene: {name: value for name, value in of.items() if name not in WITHOUT_LIST} for scene, of in found.items()}
     lists = lists if any(len(of) > 1 for of in lists.values()) else found
     present = {name for of in lists.values() for name in of}

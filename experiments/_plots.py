@@ -79,7 +79,7 @@ def _only(found: dict[str, dict[str, float]], chosen: Sequence[str]) -> dict[str
 
 
 def _beside(rows: Sequence[SearchRow]) -> bool:
-    """Whether most times were measured beside other work, or for too short to tell."""
+    """Whether most times were measured beside other work, or too briefly to tell."""
     marked = sum(row.others_cores is None or row.others_cores > _table.NOTEWORTHY_CORES for row in rows)
     return 2 * marked > len(rows)
 

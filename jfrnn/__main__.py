@@ -2,6 +2,7 @@
 
 import argparse
 import importlib.metadata
+import os
 import platform
 import sys
 import time
@@ -29,7 +30,8 @@ def main(arguments: list[str] | None = None) -> int:
         where = default_platform()
         print(f"device: {jax.devices()[0].device_kind} (JAX platform {where!r}, {jax.device_count()} in all)")
     except Exception as error:
-        print(f"JAX finds no device: {_tell(error)}")
+        asked = os.environ.get("JAX_PLATFORMS")
+        print(f"JAX finds no device{f' of JAX_PLATFORMS={asked}' if asked else ''}: {_tell(error)}")
         return 1
     missing = {name: engine.missing(where) for name, engine in ENGINES.items()}
     if missing["warp"] is None:
@@ -94,5 +96,18 @@ def _is_right(backend: Given, sums: bool) -> bool:
     return right and int(total) == (apart**2).sum() and np.array_equal(slope, -32 * apart.sum(axis=1))
 
 
+def _run() -> int:
+    """Run the command; where nobody reads what it says, or a disk is full, end without a traceback."""
+    try:
+        code = main()
+        sys.stdout.flush()
+    except OSError as error:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        if not isinstance(error, BrokenPipeError):
+            print(_tell(error), file=sys.stderr)
+        return 1
+    return code
+
+
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(_run())

@@ -1,6 +1,7 @@
 """A program that runs the Python blocks of pages as they stand, those of a page in order and in a namespace of its own.
 
-It takes the pages as arguments and prints a line for each that ran: `\\0ran`, the page, and how many lines of code it has.
+A block of text right behind a block of Python has to be what that block prints. The program takes the pages as arguments and prints
+a line for each that ran: `\\0ran`, the page, and how many lines of code it has.
 """
 
 import soon
@@ -8,24 +9,28 @@ import soon
 PROGRAM = (
     soon.PROGRAM
     + """
-import sys, traceback
+import contextlib, io, re, sys, traceback
 from pathlib import Path
 
 import jax
 
+BLOCK = re.compile(r"^```python\\n(.*?)^```\\n(?:\\n```text\\n(.*?)^```\\n)?", re.DOTALL | re.MULTILINE)
+
 for page in map(Path, sys.argv[1:]):
-    lines, running = [], False
-    for line in page.read_text(encoding="utf-8").splitlines():
-        fence = line.startswith("```")
-        running = line == "```python" if fence else running
-        lines.append(line if running and not fence else "")
+    text, names, count = page.read_text(encoding="utf-8"), {"__name__": page.stem}, 0
     jax.config.update("jax_enable_x64", False)
     try:
-        exec(compile("\\n".join(lines), str(page), "exec"), {"__name__": page.stem})
+        for block in BLOCK.finditer(text):
+            above = text.count("\\n", 0, block.start(1)) * "\\n"
+            with contextlib.redirect_stdout(io.StringIO()) as printed:
+                exec(compile(above + block[1], str(page), "exec"), names)
+            if block[2] is not None and printed.getvalue() != block[2]:
+                raise ValueError(f"{page} says that this is printed:\\n{block[2]}but it is:\\n{printed.getvalue()}")
+            count += sum(map(bool, block[1].splitlines()))
     except Exception:
         traceback.print_exc()
     else:
-        print("\\0ran", page, sum(map(bool, lines)))
+        print("\\0ran", page, count)
 """
 )
 

@@ -57,6 +57,8 @@ def check_exclusions(exclude: Given, positions: Array, asking: Array | None) -> 
     """Return pairs [e, 2], or images [e, 2 + d], as rows, or None if there are none; those that hold a -1 count as padding."""
     sources, queries = positions.shape[0], None if asking is None else asking.shape[0]
     dim = positions.shape[1]
+    if isinstance(exclude, list | tuple) and not exclude:  # NumPy would make floats of it
+        return None
     exclude = as_array("exclude", exclude)
     if not hasattr(exclude, "dtype") or not np.issubdtype(exclude.dtype, np.integer):
         told = np.dtype(exclude.dtype) if hasattr(exclude, "dtype") else type(exclude).__name__

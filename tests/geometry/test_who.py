@@ -311,6 +311,7 @@ def test_errors(error, match, make):
 
 def test_nobody_is_excluded_by_no_pairs():
     assert jfrnn.search(X, 1.0, exclude=np.zeros((0, 2), int), capacity=4).exclude is None
+    assert jfrnn.search(X, 1.0, exclude=[], capacity=4).exclude is None
     np.testing.assert_array_equal(jfrnn.count(X, 1.0, exclude=np.array([[-1, 2]])), [3] * 4)
 
 

@@ -187,6 +187,25 @@ def test_command_refuses_what_it_does_not_know(capsys):
     assert capsys.readouterr().out == f"jfrnn {jfrnn.__version__}\n"
 
 
+def test_command_ends_quietly_where_nobody_reads():
+    reader, writer = os.pipe()
+    os.close(reader)
+    command = [sys.executable, "-u", "-m", "jfrnn"]
+    done = subprocess.run(command, cwd=ROOT, stdout=writer, stderr=subprocess.PIPE, text=True, check=False)
+    os.close(writer)
+    assert (done.returncode, done.stderr) == (1, "")
+
+
+def test_command_names_the_platforms_that_were_asked_for(monkeypatch, capsys):
+    def fail():
+        raise AssertionError
+
+    monkeypatch.setattr(__main__, "default_platform", fail)
+    monkeypatch.setenv("JAX_PLATFORMS", "cuda")
+    assert __main__.main([]) == 1
+    assert "JAX finds no device of JAX_PLATFORMS=cuda: AssertionError" in capsys.readouterr().out
+
+
 def test_command_goes_on_where_an_engine_fails(monkeypatch, capsys):
     def fail(backend, sums):
         raise RuntimeError(f"{backend} breaks\nhere")
