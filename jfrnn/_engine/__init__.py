@@ -17,9 +17,9 @@ from jfrnn._engine.operands import MOST_IN_BOX, as_float
 from jfrnn._engine.plans import Clear, Launch, Plan, ask_for_huge_pages, share
 from jfrnn._engine.problem import (
     Engine,
+    Features,
     Filter,
     Inputs,
-    Kind,
     Options,
     Search,
     find_bits,

@@ -11,7 +11,7 @@ from jax.core import Tracer
 
 from jfrnn._engine.arrays import ArrayEngine
 from jfrnn._engine.hashgrid import HashGridEngine
-from jfrnn._engine.problem import ANYTHING, Engine, Kind
+from jfrnn._engine.problem import ANYTHING, Engine, Features
 from jfrnn._engine.start import check_warp, level_of_caller
 from jfrnn._engine.warp import WarpEngine
 
@@ -41,7 +41,7 @@ def parse_backend(backend: object, engines: Mapping[str, AnyEngine], where: str 
     return engines.get(backend)
 
 
-def choose_engine(named: Engine | None, sources: Array, queries: Array | None, kind: Kind = ANYTHING) -> Engine:
+def choose_engine(named: Engine | None, sources: Array, queries: Array | None, kind: Features = ANYTHING) -> Engine:
     """Return this engine, or the fastest (None); raise if a named engine does not support the search or cannot run here.
 
     Raises:

@@ -94,9 +94,14 @@ class Search(NamedTuple):
         return 0 if self.exclude is None else 1 if self.exclude.codes is None else 2
 
     @property
+    def lattice(self) -> Lattice | None:
+        """The lattice of a periodic space, or one per system."""
+        return None if self.torus is None else self.torus[0]
+
+    @property
     def per_system(self) -> bool:
         """Whether each system of the batch has a box of its own."""
-        return self.torus is not None and self.torus[0].images.per_system
+        return self.lattice is not None and self.lattice.images.per_system
 
     @property
     def sizes(self) -> tuple[int, int]:
@@ -104,7 +109,7 @@ class Search(NamedTuple):
         return self.sources.shape[0], (self.sources if self.queries is None else self.queries).shape[0]
 
 
-class Kind(NamedTuple):
+class Features(NamedTuple):
     """The features of a search that not every engine supports."""
 
     periodic: bool = False
@@ -114,7 +119,7 @@ class Kind(NamedTuple):
     excluding: bool = False
 
 
-ANYTHING = Kind()  # a search that every engine supports
+ANYTHING = Features()  # a search that every engine supports
 
 
 class Engine(Protocol):
@@ -136,7 +141,7 @@ class Engine(Protocol):
     @property
     def by_cells(self) -> bool: ...
 
-    def refuse(self, kind: Kind) -> str | None:
+    def refuse(self, asked: Features) -> str | None:
         """Return why it cannot run such a search, or None if it can."""
         ...
 

@@ -7,7 +7,7 @@ import numpy as np
 from jax import Array
 from jax.core import Tracer
 
-from jfrnn._engine import ENGINES, Filter, Inputs, Kind, Options, choose_engine, has_order, parse_backend, platform_of
+from jfrnn._engine import ENGINES, Features, Filter, Inputs, Options, choose_engine, has_order, parse_backend, platform_of
 from jfrnn._geometry import (
     EXCHANGED,
     Batch,
@@ -152,7 +152,7 @@ def check_problem(
     if box is not None and box.per_system:
         _check_boxes(batch)
     images = None if box is None else images_of(box, reach, dtype, sources.shape[0])
-    kind = Kind(periodic=box is not None, radii=radii is not None, batch=batch is not None, excluding=exclude is not None)
+    kind = Features(periodic=box is not None, radii=radii is not None, batch=batch is not None, excluding=exclude is not None)
     engine = choose_engine(parse_backend(backend, ENGINES), sources, queries, kind)
     systems = None if batch is None else check_batch(batch, sources, queries)
     ordered = has_order(engine, platform_of(sources), sources.shape[0], queries is None and radii is None)
