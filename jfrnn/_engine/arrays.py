@@ -69,6 +69,7 @@ class ArrayEngine:
     by_cells: bool
     static_radius = False
     translates = False
+    native = False
 
     def refuse(self, asked: Features) -> str | None:
         """Return None: it supports every search."""

@@ -53,11 +53,9 @@ def choose_engine(named: Engine | None, sources: Array, queries: Array | None, k
         return fastest_engine(platform_of(sources, sources if queries is None else queries), sources.shape[0])
     if reason := named.refuse(kind):
         raise ValueError(f"backend={named.name!r} {reason}")
-    if isinstance(named, ArrayEngine):
-        return named
-    check_warp()
     platform = platform_of(sources, sources if queries is None else queries)
     if reason := _what_is_missing(named, platform):
+        check_warp()  # says what to install
         raise RuntimeError(f"backend={named.name!r} cannot run on the platform {platform!r}: {reason}. Pass backend='jax'.")
     return named
 

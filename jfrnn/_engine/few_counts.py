@@ -33,7 +33,7 @@ def count_few(inputs: Inputs, options: Options) -> np.ndarray | None:
     if (
         not plain
         or not isinstance(cutoff, Cutoff)
-        or not options.engine.translates
+        or not options.engine.native
         or options.closed
         or not 0 < n <= _MOST
         or (box is not None and box.per_system)

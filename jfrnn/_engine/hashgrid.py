@@ -26,6 +26,7 @@ class HashGridEngine:
     name = "hashgrid"
     static_radius = True
     translates = False
+    native = False
     by_cells = True
 
     def refuse(self, asked: Features) -> str | None:

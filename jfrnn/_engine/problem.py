@@ -129,6 +129,7 @@ class Engine(Protocol):
         name: The name that users pass as `backend`.
         static_radius: Whether it has to know the cutoff while tracing.
         translates: Whether it can sum a function over pairs, translated to native code.
+        native: Whether compiled kernels serve the lists that it has found, and renew them: its searches are in the cells of CUDA.
         by_cells: Whether array programs that run in its place find candidates by cells instead of testing all sources.
     """
 
@@ -138,6 +139,8 @@ class Engine(Protocol):
     def static_radius(self) -> bool: ...
     @property
     def translates(self) -> bool: ...
+    @property
+    def native(self) -> bool: ...
     @property
     def by_cells(self) -> bool: ...
 

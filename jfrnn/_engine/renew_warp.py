@@ -18,7 +18,7 @@ from jfrnn._engine.operands import MOST_IN_BOX, lattice_numbers
 from jfrnn._engine.plans import Launch, Plan
 from jfrnn._engine.problem import Inputs, Options
 from jfrnn._engine.variants import describe_call
-from jfrnn._engine.warp import PLATFORMS, WarpEngine, all_meet, plan_few, plan_on_cuda
+from jfrnn._engine.warp import PLATFORMS, all_meet, plan_few, plan_on_cuda
 from jfrnn._geometry import (
     FAR,
     FAR_BITS,
@@ -67,7 +67,7 @@ def can_renew(inputs: Inputs, options: Options, capacity: int) -> bool:
     if PLATFORMS.get(platform_of(inputs.sources)) != "cuda":
         return False
     images, cutoff = options.images, inputs.cutoff
-    plain = isinstance(options.engine, WarpEngine) and isinstance(cutoff, Cutoff) and not cutoff.scaled
+    plain = options.engine.native and isinstance(cutoff, Cutoff) and not cutoff.scaled
     alone = all(x is None for x in (inputs.queries, inputs.active, inputs.batch, inputs.exclude))
     boxed = images is None or (images.nearest and images.orthogonal and not images.counts_short and not images.per_system)
     n = inputs.sources.shape[0]

@@ -62,6 +62,7 @@ class WarpEngine:
     name = "warp"
     static_radius = False
     translates = True
+    native = True
     by_cells = True
 
     def refuse(self, asked: Features) -> str | None:
@@ -117,7 +118,7 @@ def has_order(engine: Engine, platform: str, n: int, plain: bool) -> bool:
 
     `plain`: without queries, and with one cutoff.
     """
-    return isinstance(engine, WarpEngine) and PLATFORMS.get(platform) == "cuda" and n > few_cuda.MOST and plain
+    return engine.native and PLATFORMS.get(platform) == "cuda" and n > few_cuda.MOST and plain
 
 
 def by_cells_or_tree(cells: Callable[..., Found], tree: Callable[..., Found], search: Search, *more: tuple[Array, ...]) -> Found:

@@ -168,7 +168,7 @@ class EdgeList(KeptSearch):
         kind = self.problem.options
         images = 1 if codes is None or kind.images is None else kind.images.total
         codes = None if codes is None else codes[:, None]
-        return Topology(named[:, None], codes, reverse, None, points, images, False, kind.engine.translates)
+        return Topology(named[:, None], codes, reverse, None, points, images, False, kind.engine.native)
 
     def _check_single(self) -> None:
         if self.senders.ndim != 1:

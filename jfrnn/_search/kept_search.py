@@ -300,7 +300,7 @@ class KeptSearch(KeptOptions):
         sources, rows = self._check_points(positions, queries)
         box = self._box_now(box, sources)
         asking = rows if self.own_queries else None
-        real, asking = real_points(sources, asking, box, self.batch, self.problem.options.engine.translates)
+        real, asking = real_points(sources, asking, box, self.batch, self.problem.options.engine.native)
         return real, real if asking is None else asking, box
 
     def _check_points(self, positions: Points, queries: Points | None) -> tuple[Array, Array]:

@@ -56,7 +56,7 @@ def find_flat_fields(inputs: Inputs, options: Options, total: int, moving: bool,
     rows, fields = found.rows, _common_fields(inputs, options, found, moving)
     fields |= {"senders": rows.idx, "receivers": rows.receivers, "offsets": offsets, "reverse": None}
     if reversing and rows.idx is not None:
-        fields["reverse"] = find_reverse(rows.idx[:, None], None, 1, len(inputs.sources), False, options.engine.translates)
+        fields["reverse"] = find_reverse(rows.idx[:, None], None, 1, len(inputs.sources), False, options.engine.native)
     return fields
 
 

@@ -157,7 +157,7 @@ def check_problem(
     systems = None if batch is None else check_batch(batch, sources, queries)
     ordered = has_order(engine, platform_of(sources), sources.shape[0], queries is None and radii is None)
     static_reach = reach if engine.static_radius else None
-    sources, queries = real_points(sources, queries, box, systems, engine.translates)
+    sources, queries = real_points(sources, queries, box, systems, engine.native)
     options = Options(keep, engine, closed, 0.0 if radii is None else skin, images, static_reach, ordered)
     shape = {"own_queries": queries is not None, "masked": active is not None, "source_count": sources.shape[0]}
     problem = Problem(options, radius, skin, **shape, dim=sources.shape[1], dtype=dtype)
