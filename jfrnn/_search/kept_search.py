@@ -17,7 +17,6 @@ from jfrnn._geometry import (
     ROWS_ARE_WHOLE,
     Batch,
     Box,
-    Cutoff,
     Exclusions,
     Images,
     Radii,
@@ -40,10 +39,11 @@ from jfrnn._geometry import (
 )
 from jfrnn._search.culprits import name_culprits
 from jfrnn._search.fractional import real_points
-from jfrnn._search.geometry import ImageCodes, ImagesMade
 from jfrnn._search.kept_options import KeptOptions
+from jfrnn._search.present import ImageCodes, Present
 from jfrnn._search.problem import Problem
 from jfrnn._search.reverse import Reverse
+from jfrnn._search.topology import Topology
 from jfrnn._search.verlet import Verlet, has_moved_too_far
 from jfrnn._tracing import Flags, Given, Numbers, Points, Real, call_apart, compile_program, on_platform, own_transfers
 
@@ -288,12 +288,13 @@ class KeptSearch(KeptOptions):
         reach = self.problem.reach(radii)
         return grow_images(self.box_kind, (box, self.box), reach, self.dtype, self.source_count, short)
 
-    def _cutoff_of_pairs(self) -> Cutoff | Radii | None:
-        return self.radii if self.cutoff is None else make_cutoff(self.cutoff, self.dtype, self.closed)
-
-    def _images_made(self) -> ImagesMade:
+    def _present(self, topology: Topology, count: Array, sources: Array, rows: Array, box: Box | None) -> Present:
+        """Return the list at positions that are lengths, in the present box."""
+        cutoff = self.radii if self.cutoff is None else make_cutoff(self.cutoff, self.dtype, self.closed)
         made = None if self.images is None or self.verlet is None else (self.verlet.positions, self.verlet.queries)
-        return self.images, made
+        where = (None, None, None) if box is None else (box, self.batch, self.box_kind)
+        forward = self.half and where[2] is not None and where[2].counts_short
+        return Present(topology, count, (self.images, made), sources, rows, *where[:2], cutoff, where[2], self.closed, forward)
 
     def _geometry_inputs(self, positions: Points, queries: Points | None, box: Box | None) -> tuple[Array, Array, Box | None]:
         """Return the present positions of sources and rows, as lengths, and the present box, after checking that they fit."""

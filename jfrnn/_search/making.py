@@ -8,7 +8,7 @@ from jax import lax
 
 from jfrnn._engine import Found, Inputs, Options, count_few, count_rows, hide_inactive, list_flat, list_rows, take_present
 from jfrnn._geometry import Radii
-from jfrnn._search.geometry import ImageCodes
+from jfrnn._search.present import ImageCodes
 from jfrnn._search.reverse import find_reverse
 from jfrnn._search.topology import make_topology
 from jfrnn._search.verlet import first_verlet

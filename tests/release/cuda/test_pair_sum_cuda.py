@@ -13,7 +13,7 @@ import pytest
 import jfrnn
 from jfrnn._engine import boxes_warp, warp_sums
 from jfrnn._engine.variants import SUMS, names_of_cutoffs, names_of_tree
-from jfrnn._search.problem import check_problem
+from jfrnn._search.problem import Asked, check_problem
 from jfrnn._sums import fused as _fused
 from jfrnn._sums.verb import _with_engine
 from jfrnn.kernels import Kind, _compile, few_cuda, pair_sum_cpu, pair_sum_cuda
@@ -163,7 +163,7 @@ def test_rows_of_values_begin_where_16_bytes_may_be_loaded(double):
 
 def test_auto_takes_the_kernel_on_cuda_and_jax_elsewhere(monkeypatch):
     x = np.zeros((4, 3), np.float32)
-    problem, inputs = check_problem(x, 1.0, None, None, None, "gather", None, None, False, False, False, "auto", 0.0, None)
+    problem, inputs = check_problem(Asked(x, 1.0))
     monkeypatch.setattr("jfrnn._sums.verb.platform_of", lambda *_: "gpu")
     for backend in ("auto", "warp"):
         options = _with_engine(problem.options, inputs, backend == "auto")
@@ -178,7 +178,7 @@ def test_a_box_holds_as_many_particles_as_their_numbers_leave_room_for(monkeypat
     """An image's code takes bits of the number; on the CPU it does not."""
     monkeypatch.setattr(_fused, "MOST_IN_BOX", 4)
     x, box = np.zeros((4, 3), np.float32), jfrnn.Box([4.0] * 3)
-    _, inputs = check_problem(x, 1.0, None, box, None, "gather", None, None, False, False, False, "warp", 0.0, None)
+    _, inputs = check_problem(Asked(x, 1.0, box=box, backend="warp"))
     assert _fused.refusal(inputs, "cpu") is None
     assert _fused.refusal(inputs._replace(box=None), "gpu") is None
     assert _fused.refusal(inputs, "gpu") == "of more than 3 positions in a periodic box on the platform 'gpu'"
