@@ -1,12 +1,12 @@
-"""How C++ and CUDA of `kernels/native` become the programs of variants.
+"""How C++ and CUDA of `kernels/native` become programs.
 
-A kernel is a struct in a header, a method of which does the work. `program` is the whole text: what a variant fixes (the type of
+A kernel is a struct in a header, a method of which does the work. `program` is the whole text: what is static (the type of
 positions, their dimension, named integers), the headers that this one includes, and the header.
 
 `cutoff`, an array of one scalar, is an argument of all of them. Where space is periodic, the radius in it is followed by the
 lattice: its vectors and the transform, row by row (3 x 3 each); origin, half the width of the stencil in units of the transform,
 images within reach (3 each); slack. Where it is skewed, its vectors as they were given follow, and which whole numbers of those the
-vectors are (3 x 3 each). Of a batch, the highest number of a system comes last. Such integers are the bits of a float, or the value
+vectors are (3 x 3 each). In a batch, the highest number of a system comes last. Such integers are the bits of a float, or the value
 of a double.
 """
 

@@ -30,7 +30,7 @@ class ListKind(NamedTuple):
     Attributes:
         kind: What is static about its pairs, and about sums over them; of `batched` and what follows from rows it says nothing.
         images: How many images a code tells apart; kernels are told when they run.
-        code_bytes: Of the image code of a slot; 0 without.
+        code_bytes: Bytes of the image code of a slot; 0 without.
         reversed: Whether rows are those of the sources of the list.
         aligned: Whether rows of ids begin at multiples of 16 bytes.
         ordered: Whether an order is given in which rows are taken (CUDA).

@@ -100,7 +100,7 @@ class TermText(NamedTuple):
 
     @property
     def reads_rows(self) -> int:
-        """Of j, whether it reads what rows of particles in a box hold, positions and turns: 1, or 2 where any turn is not -1, 0, 1.
+        """Whether it reads of j what rows of particles in a box hold, positions and turns: 1, or 2 where any turn is not -1, 0, 1.
 
         The displacement of particles that lie in the boxes beside is that of wrapped positions, hardly rounded.
         """

@@ -7,7 +7,7 @@ share: of a few pairs at a time, while it evaluates the term for those before. I
 i and j, packed as in `jfrnn._box`: with the image of a neighbor they make its lattice shift S. In place of sums it can find the
 largest summands, and whose they are.
 
-Of a million particles with 108 neighbors (float32), 32 queries meet 570 candidates near their box. Evaluating the term for all
+Where a million particles have 108 neighbors (float32), 32 queries meet 570 candidates near their box. Evaluating the term for all
 of them would take 570 steps of the warp; for the pairs of one block of 32 at a time 345, as lanes wait for the one with most;
 for those of 22 blocks 116. On an H200 a warp executes 9400 instructions for a density, 3600 of them for the pairs it found,
 1900 in tensor cores and around them; schedulers issue in 64 % of their cycles; a fifth of the time warps wait for what they

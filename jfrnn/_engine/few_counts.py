@@ -1,7 +1,7 @@
 """How many neighbors few particles have, without a program for their number: by the kernel of one structure after another.
 
-A compiled count takes a tenth of a second to make and hardly any time to run. Of shapes that come a few times, as in a data set of
-crystals, it would be compiled for nothing.
+A compiled count takes a tenth of a second to make and hardly any time to run. For shapes that come a few times, as in a data set
+of crystals, it would be compiled for nothing.
 """
 
 from collections import OrderedDict

@@ -113,8 +113,8 @@ def kept_sums(
     """Sum a term over the pairs of a list, as `jfrnn._engine.warp_sums.pair_sums` does over those of a search.
 
     `values` are what all pairs share, what is read of i, or None where that is of the same arrays as what is read of j, and what is
-    read of j. `apart`: a particle's pair with itself, without a shift, is left out. Of extremes, the place in the row stands for
-    the code of an image.
+    read of j. `apart`: a particle's pair with itself, without a shift, is left out. An extreme has its place in the row
+    in place of the code of an image.
     """
     mirrored = values[1] is None
 

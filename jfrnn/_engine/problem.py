@@ -57,7 +57,7 @@ class Room(NamedTuple):
 class Rows(NamedTuple):
     """Neighbors of m queries: [m, capacity] int32 source indices, unused slots n (None if only counted), and [m] int32 true counts.
 
-    Of a flat list, `idx` [total] are the sources, and `receivers` [total] the rows; what stands behind the last pair is undefined.
+    In a flat list, `idx` [total] are the sources, and `receivers` [total] the rows; what stands behind the last pair is undefined.
     `required` [] int32 is the length of the longest row, `status` [] int32 the bits of `Status`. `order` [n] int32 are the sources
     as they follow each other in space, if that is asked for; -1 where their numbers do so already.
     """

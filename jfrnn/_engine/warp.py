@@ -47,9 +47,9 @@ PLATFORMS = {"cpu": "cpu", "gpu": "cuda", "cuda": "cuda"}  # names in JAX, names
 _CELLS = {"cpu": cells_cpu, "cuda": cells_cuda}
 QUERIES_PER_THREAD = 1024  # on the CPU, at least: among 1000, to wake a second thread takes as long as it saves
 
-# Of cutoffs that differ, on CUDA: how many sources within the largest cutoff a query may meet among cells, and how many more for
-# each that is near, before a tree is searched; and how many queries and sources tell. The first two were measured on an H200 for a
-# walker that trees have replaced, and that was slower: where a tree begins to be faster has not been measured.
+# On CUDA, cutoffs that differ are searched in a tree if queries meet more sources than these within the largest cutoff: so many
+# each, and so many more for each source that is near. SAMPLED queries and sources tell. The first two were measured on an H200 for
+# a walker that trees have replaced, and that was slower: where a tree begins to be faster has not been measured.
 MOST_MET, MOST_MORE, SAMPLED = 2000, 8, (1024, 4096)
 Given = Callable[[Search], dict[str, Array]]  # makes what kernels are given besides, by its names
 Found = TypeVar("Found")  # what a search or a sum returns

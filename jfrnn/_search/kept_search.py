@@ -353,11 +353,13 @@ def _make_again_if_stale(nbrs: Kept, inputs: Inputs) -> Kept:
     now = hide_inactive(sources, take_present(inputs).active)
     moved = has_moved_too_far(nbrs.verlet, now, queries, box, nbrs.box_kind, radii, nbrs.skin, nbrs.batch)
     fixed = {"box": box, "radii": radii, "batch": nbrs.batch, "exclude": nbrs.exclude}
-    nobody = dict.fromkeys(fixed)  # what stays is no state of the loop, so that XLA derives from it once what steps of a scan need
-    state = moved, _replace(nbrs, **nobody)
+    left_out = dict.fromkeys(
+        fixed
+    )  # what stays is no state of the loop, so that XLA derives from it once what steps of a scan need
+    state = moved, _replace(nbrs, **left_out)
 
     def body(state: tuple[Array, Kept]) -> tuple[Array, Kept]:
-        return jnp.zeros_like(state[0]), _replace(_make_again(state[1], inputs), **nobody)
+        return jnp.zeros_like(state[0]), _replace(_make_again(state[1], inputs), **left_out)
 
     # a loop of at most one iteration: XLA updates a loop's carry in place, but copies the results of a branch
     return _replace(lax.while_loop(lambda state: state[0], body, state)[1], **fixed)

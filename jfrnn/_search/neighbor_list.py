@@ -171,7 +171,7 @@ class NeighborList(ListExports):
         from jfrnn._search.lengths import lengths
 
         with own_transfers():
-            made, mask = lengths(self._at(sources, sources, box))
+            made, mask = lengths(self._present(topology, self.count, sources, sources, box))
             return self._mark(made), mask
 
     def edges(

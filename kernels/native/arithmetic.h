@@ -58,7 +58,7 @@ struct Arithmetic : Numbers {
     JFRNN_GENERIC T either(T x, T y) { return x | y; }
     JFRNN_GENERIC T differ(T x, T y) { return x ^ y; }
     JFRNN_GENERIC T inverse(T x) { return ~x; }
-    // Of one number each.
+    // These take one number each.
     JFRNN_GENERIC T quotient(T x, T y) {
         constexpr T LEAST = T(1ull << (8 * sizeof(T) - 1));
         return y == 0 ? -1 : x == LEAST && y == -1 ? x : x / y;

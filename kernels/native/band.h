@@ -38,7 +38,7 @@ struct Bands {
         const Numbers least = Numbers{} + LEAST, outer = (r > least ? r : least) + slack;
         return outer * outer * (1 + CUTOFFS * EPS);
     }
-    // The band of a cutoff of many. Of a table it may be below 0: then species are no neighbors.
+    // The band of one of many cutoffs. One from a table may be below 0: then species are no neighbors.
     template <class Numbers, class Slack>
     JFRNN_MATH Band<Numbers> bounds_of(Numbers r, Slack slack) {
         const Numbers none = Numbers{} - 1, nearest = Numbers{} + LEAST + slack, inner = r - slack;

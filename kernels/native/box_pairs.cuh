@@ -10,8 +10,8 @@
 // axis, and `ids` their numbers. Rows of `positions` and `queries` are as they were given, with packed turns. Queries that are the
 // sources are served in the order of `ids`, others as they come; `systems` are theirs.
 // Where cutoffs differ (RULE, see pair_cutoffs.h), `radii` are those of the sources, sorted, `query_radii` those of the queries, as they
-// come. Of a table the cutoffs of `kinds` species with each other follow row by row, -1 where they are no neighbors; whose species is
-// which say `kinds_of_sources`, sorted, and `kinds_of_queries`. The radius is then the largest of all, which nobody's cutoff exceeds.
+// come. A table has the cutoffs of `kinds` species with each other, row by row, -1 where they are no neighbors; `kinds_of_sources`,
+// sorted, and `kinds_of_queries` are the species. The radius is then the largest of all cutoffs.
 #pragma once
 #include "box_space.h"
 #include "excluded.h"

@@ -87,7 +87,7 @@ struct CellWalk : Walk<Query> {
         int from[3] = {0, 0, 0}, to[3] = {0, 0, 0};
         for (int k = 0; several && k < DIM; ++k)
             if (is_periodic(k)) {
-                const int most = lattice.images(k);  // rounded up, a query may reach an image that nobody can
+                const int most = lattice.images(k);  // rounded up, a query may reach an image that is beyond every cutoff
                 from[k] = period_of(k, first[k]) < -most ? -most : period_of(k, first[k]);
                 to[k] = period_of(k, last[k]) > most ? most : period_of(k, last[k]);
             }

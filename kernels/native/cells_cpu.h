@@ -140,7 +140,7 @@ struct Sort : SortArguments, Places {
         return finite;
     }
 
-    // Of the table of a system, at least: rows of cells are no longer than half of that, so that they share entries at one end alone.
+    // The table of a system has at least so many entries: rows of cells are no longer than half of that, and share entries at one end.
     static constexpr int ENTRIES = 16;  // as in jfrnn/kernels/cells_cpu.py
     // Lays out the cells of each system, whose box is its own: those of one follow those of the one before it.
     void lay_out_boxes(Grid& grid) {

@@ -8,7 +8,7 @@
 
 constexpr int SAMPLES = 2048;  // queries that are asked how much they would meet
 constexpr int SAMPLED = 256;   // cutoffs, and coordinates, that tell what is typical
-constexpr int MOST_NEAR = 64;  // cells beyond which nobody knows how much is in those that are near
+constexpr int MOST_NEAR = 64;  // cells beyond which it is not counted how much the near ones hold
 constexpr int MOST_MET = 16;   // candidates for each pair, as an average, in cells
 
 struct CutoffSort : TreeSortArguments {

@@ -50,7 +50,7 @@ struct Plan {
 
 // What Python tells once: functions that are called, and the plans there are.
 struct Desk {
-    // What asks for the plan of a name: it writes down what goes wrong, or an empty text.
+    // Asks Python for the plan of a name, and writes down what goes wrong, or an empty text.
     void (*make_plan)(const char* name, long long name_size, const char* recipe, long long recipe_size, int device, char* wrong);
     int (*yield)();
     int (*advise)(void* address, size_t size, int advice);

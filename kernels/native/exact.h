@@ -96,7 +96,7 @@ struct Exact {
             }
             high = mul(high, scale);
             low = mul(low, scale);
-            // Beyond, nobody is a pair, and sums may overflow. How large this bound is does not matter: error-free sums hold at any
+            // Beyond, there are no pairs, and sums may overflow. How large this bound is does not matter: error-free sums hold at any
             // size, and what overflows leaves a NaN in `rest`, with which no comparison below is true: the answer is 2.
             plain = plain && size_of(high) < 1e6;
             const double square = mul(high, high), tail = mul(mul(2, high), low);

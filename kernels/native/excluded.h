@@ -4,8 +4,8 @@
 #include "device.h"
 
 // A row of `ids`, those of the query from `starts[query]` on, in ascending order; without EXCLUDING there are no rows. Where EXCLUDING is
-// 2, an id names an image of a source: source + n * code. Of short rows a filter has a bit for each number modulo 64 that stands there:
-// it tells most other sources apart without a look at the row.
+// 2, an id names an image of a source: source + n * code. A short row has a filter, with a
+// bit for each number modulo 64 that stands there: it tells most other sources apart without a look at the row.
 struct Excluded {
     static constexpr int SHORT = 64, MOST_KEPT = 4, NOBODY = -1, MANY = -2;
     // The id of a source, of which there are n, in an image.

@@ -134,7 +134,7 @@ struct Group {
             }
         }
     }
-    // Of cutoffs that differ: the square, in units of the box, beyond which nothing is a neighbor by a cutoff.
+    // Returns the square, in units of the box, beyond which nothing is a neighbor by this one of cutoffs that differ.
     JFRNN_MEMBER real near_of(const PairSearch& search, real cutoff) const {
         const real off = CROSSING ? 2 * search.lattice.slack() * scale : real(0);
         const real square = PairCutoffs::outside_of(cutoff * scale, off) * (1 + 16 * PairSearch::step_eps) * unit * unit;

@@ -9,7 +9,7 @@
 // rows are those of the sources of the list, whose slots are `lengths` many in `slots` from `starts` on, and j is who has such a slot.
 // ORDERED: threads take rows as `order` has them, so that rows that are taken together read the same sources, or as they come where it
 // holds -1. APART: a particle's pair with itself, without a shift, is left out. ITSELF: it is a pair, whatever the cutoff.
-// Source n stands behind all others, and its numbers are NaN: it is what slots hold that are not used, so nobody asks which ones are.
+// Unused slots hold n. Source n stands behind all others, and its numbers are NaN, so that unused slots never pass the test.
 #pragma once
 #include "codes.h"
 #include "math.h"

@@ -4,7 +4,7 @@
 #include "kept.h"
 #include "wide.h"
 
-// Of LANES slots: their sources, the numbers of these, and which of them are pairs.
+// LANES slots that are taken together: their sources, the numbers of these, and which of them are pairs.
 struct KeptSlots {
     const int* ids;
     int places;  // their places in the row, from `places` on

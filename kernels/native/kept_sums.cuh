@@ -10,7 +10,7 @@ struct KeptSums : KeptLane {
     JFRNN_MEMBER explicit KeptSums(const KeptSumsArguments& a)
         : KeptLane(a), shared_values(a.shared_values), own_values(a.own_values), results{a.sums, a.errors, a.n, a.totals} {}
 
-    // Of extremes, the place in the row stands for the code of an image.
+    // An extreme has its place in the row where those of a search have the code of an image.
     JFRNN_MEMBER void run() const {
         const int lane_of_warp = threadIdx.x & 31;
         const long long warp = thread_index() >> 5;

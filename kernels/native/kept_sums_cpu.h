@@ -11,7 +11,7 @@ struct KeptSums : KeptRows<KeptSums> {
     explicit KeptSums(const KeptSumsArguments& a)
         : KeptRows(a, a.info), own_values(a.own_values), term(a.shared_values), results(a.sums, a.totals, a.errors, a.n) {}
 
-    // Of extremes, the place in the row stands for the code of an image.
+    // An extreme has its place in the row where those of a search have the code of an image.
     void serve(int row, const OwnPoint& own) {
         const Term::Own own_part = term.own(own_numbers(own_values, row), own.q);
         const Term term = this->term;  // a variable, which stays in registers

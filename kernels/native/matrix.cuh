@@ -15,13 +15,13 @@ JFRNN_FUNCTION unsigned int halves(float x, float factor) {
 // What most pairs are decided by. With a and b from the center, |b - a|^2 - r^2 + coarse_band is
 // -2 a.b + |b|^2 * 1 + 1 * (|a|^2 - r^2 + coarse_band): products of rows and columns, in which a number is two halves, high and low.
 // The tensor cores multiply them exactly and add in single precision at least, in whatever order, flushing or not flushing halves
-// that are denormal (PTX ISA, mma). Of reach^2, 16 sums of terms that add up to 6.5 lose less than 1.3e-5, flushing (reach > 120, or
-// it does not matter) less than 4e-6, splitting and scaling less than 2e-6: less than the band of 2e-5. Negative: surely closer than
+// that are denormal (PTX ISA, mma). In units of reach^2, 16 sums of terms that add up to 6.5 lose less than 1.3e-5, flushing
+// (reach > 120, or it does not matter) less than 4e-6, splitting and scaling less than 2e-6: less than the band of 2e-5. Negative: surely closer than
 // the cutoff; beyond 2 coarse_band: surely not; between: decided one by one. On a lattice squares are whole numbers of squared units,
 // of which that band is less than a quarter, and the limit lies in the middle between two of them: all signs are sure.
 //
-// Of few species, r^2 is a product, too: of what a query's is with each species, and of which species the candidate is. These are three
-// sums more, of terms that add up to 7.5: less than 1.8e-5 is lost, and the band is 3e-5.
+// Where species are few, r^2 is a product, too: that of a row with r^2 of the query for each species, and of a column with a 1 at the
+// species of the candidate. These are three sums more, of terms that add up to 7.5: less than 1.8e-5 is lost, and the band is 3e-5.
 struct Matrix {
     unsigned int high[4], low[4];                  // rows, the queries of a quad of lanes, whose lanes hold one column each
     unsigned int of_kinds[RULE == TABLE ? 4 : 1];  // and of a species each

@@ -9,7 +9,7 @@ constexpr bool BANDED = RULE == SCATTER || RULE == EITHER || RULE == BOTH;  // t
 constexpr bool BY_OWN = RULE == GATHER || RULE == BOTH || RULE == TABLE;    // no pair of a query is beyond its own cutoff
 
 struct PairCutoffs : Bands {
-    // The cutoff of a pair, of those of both particles; a mean is rounded. Of a table, what no pair is beyond.
+    // The cutoff of a pair, of those of both particles; a mean is rounded. With a table it is the largest cutoff of all.
     template <class Numbers>
     JFRNN_MATH Numbers of_pair(Numbers own, Numbers other) {
         if constexpr (RULE == GATHER)

@@ -49,7 +49,7 @@ struct Sums : Walk<Sums> {
     // Reduces the pairs that are held to what their queries get.
     JFRNN_MEMBER void settle(const Group& group, const Pairs& pairs, bool finished) {
         Warp& warp = shared_warp();
-        warp.hits[pairs.tested / 32][lane] = 0;  // of the block behind the last one: nobody has met it
+        warp.hits[pairs.tested / 32][lane] = 0;  // no lane has met the block behind the last one
         // a lane that has no pair left reads the id behind a block's, and nothing comes of it; but it must be a place
         if (lane < 2 && pairs.kept <= pairs.tested + 32 * lane)
             warp.ids[pairs.tested + 32 * lane] = 0;

@@ -48,8 +48,8 @@ JFRNN_INLINE static void two_sum(Number& sum, Number& error, Number x) {
     sum = s;
 }
 
-// Of a summand the largest, its source and the code of its image. NaN is larger than all; of equal ones comes first the smallest source,
-// then the smallest image.
+// The largest value of a summand, its source and the code of its image. NaN is larger than all. Equal values are ordered by their
+// sources, then by their images: the smallest comes first.
 struct Extreme {
     real best;
     int source, code;

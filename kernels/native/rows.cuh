@@ -86,7 +86,7 @@ struct Rows : Walk<Rows> {
     // Writes the pairs that are held into the rows.
     JFRNN_MEMBER void settle(const Group& group, const Pairs& pairs, bool finished) {
         Warp& warp = shared_warp();
-        // Behind the last block stands one of fill values, with which all rows are filled up, or one that nobody has met.
+        // Behind the last block stands one of fill values, with which all rows are filled up, or one that no query has met.
         warp.hits[pairs.tested / 32][lane] = finished ? ALL : 0;
         if (finished)
             warp.ids[pairs.tested + lane] = fill_value();

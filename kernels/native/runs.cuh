@@ -127,7 +127,7 @@ struct CellRuns {
         }
         return share_runs(search, from, size, mine.image);
     }
-    // Finds a row of cells in its own image; it has none where rounding has reached for an image that nobody can.
+    // Finds a row of cells in its own image; it has none where rounding has reached for an image that is beyond every cutoff.
     JFRNN_FUNCTION CellRow cut_row(const PairSearch& search, const whole* first, int wide, int across, int length, int row) {
         const int line = row / across, level = line / wide;
         whole cell[3] = {first[0], first[1] + (line - level * wide), first[2] + level}, last = first[0] + length - 1;

@@ -11,7 +11,7 @@ struct SumsArguments {
     int *info, *scratch;
     int n, m, own, table, closed, drop_self, kinds;
 
-    // Of a search nothing is written but scratch.
+    // The arguments of a search that writes nothing but scratch.
     JFRNN_MEMBER SearchArguments of_search() const {
         return {positions, queries, cutoff, excluded_starts, excluded, nullptr, radii, query_radii, table_of_kinds,
             kinds_of_sources, kinds_of_queries, nullptr, nullptr, nullptr, info, scratch, n, m, own, table, 0, closed, drop_self, 0,

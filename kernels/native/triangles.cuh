@@ -38,7 +38,7 @@ struct Triangles : TrianglesArguments, Space {
     int* cursor;
     int* first;  // particles of each key, then the first place of theirs
     int *key, *slot, *order;
-    int* queue;  // nobody asks for slots once particles are scattered
+    int* queue;  // takes the place of slots, which are not needed once particles are scattered
     Entry* entry_of;
     int* room;  // for integers
 

@@ -22,7 +22,7 @@ struct Run {
 };
 struct alignas(16) Warp {
     union {
-        // Of a ring of candidates near the box: columns of a matrix, pairs of halves, or coordinates, and what says their cutoffs.
+        // A ring of candidates near the box: columns of a matrix, pairs of halves, or coordinates, and what says their cutoffs.
         real candidates[(MATRIX ? 4 : DIM) + OF_CUTOFFS][RING + 8];
         // Per query, while rows are written: addresses of the ids that are next, two in a word; the stride is odd, for the banks.
         unsigned int lists[SUMS ? 1 : 32][LISTED / 2 + 3];
