@@ -19,7 +19,7 @@ from jfrnn.kernels._text import resolve
 
 CELLS_PER_PARTICLE = 4  # size of the cell table; 16 B per particle
 SMALLEST_TABLE = 4096
-# Arrays that are given where kernels are EXCLUDING (native/excluded.h), and else left out.
+# Arrays that are given where kernels are EXCLUDING (native/decide/excluded.h), and else left out.
 EXCLUDED = ("excluded_starts", "excluded")
 TABLE = ("table_of_kinds", "kinds_of_sources", "kinds_of_queries")  # arrays that the last of these rules asks for
 ORDERS = ("source_order", "query_order")  # arrays that a tree on CUDA is fitted to

@@ -2,7 +2,7 @@
 
 `build` sorts the sources (and the queries, if they are others) by cell. `gather` puts the coordinates of many sources into that
 order: to read them from anywhere takes longer than all that `build` does. Threads that run it or `query` hand
-themselves chunks of places from an atomic counter (see `native/walk_cpu.h`).
+themselves chunks of places from an atomic counter (see `native/walk/walk_cpu.h`).
 """
 
 import functools

@@ -1,10 +1,10 @@
 """Search on the CPU where cutoffs differ: in cells where they are alike, else in a tree of boxes around sources along a curve.
 
-`build` decides which, by a sample (`native/cutoffs_cpu.h`): cells find the candidates of queries in half the time, if what they
+`build` decides which, by a sample (`cutoffs_cpu.h`): cells find the candidates of queries in half the time, if what they
 hold beyond what is near is not many times as much. It sorts sources and queries by cell, or along a curve and makes the tree
-(`native/tree_cpu.h`); `gather` puts many sources in order. Then threads hand themselves chunks of queries: those that follow each
-other, and whose cutoffs are alike, find the cells (`native/cell_walk_cpu.h`) or the leaves (`native/tree_walk_cpu.h`) that are near
-all of them, and meet their sources (`native/walk_cpu.h`). So time follows pairs and particles, whatever the spread of cutoffs is,
+(`tree_cpu.h`); `gather` puts many sources in order. Then threads hand themselves chunks of queries: those that follow each
+other, and whose cutoffs are alike, find the cells (`cell_walk_cpu.h`) or the leaves (`tree_walk_cpu.h`) that are near
+all of them, and meet their sources (`walk_cpu.h`). So time follows pairs and particles, whatever the spread of cutoffs is,
 and whatever the density.
 """
 

@@ -118,7 +118,7 @@ def _with_table(numbers: dict[str, int], shapes: Shapes) -> dict[str, int]:
 
 
 def _operands(search: Search) -> list[Array]:
-    """Return what a kernel is given, in the order of `_GIVEN` (see `kernels/native/box_pairs.cuh`)."""
+    """Return what a kernel is given, in the order of `_GIVEN` (see `kernels/native/boxes/box_pairs.cuh`)."""
     sources, queries, batch, torus = search.sources, search.queries, search.batch, search.torus
     if batch is None or torus is None:
         raise TypeError("a search with a box per system has a batch and a lattice.")

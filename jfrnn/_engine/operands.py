@@ -60,7 +60,7 @@ def lattice_numbers(lattice: Lattice, reach: Array, slack: Array, flags: Array |
 
 
 def excluded_rows(search: Search) -> list[Array]:
-    """Return the rows of sources that queries exclude, as kernels read them (see `kernels/native/excluded.h`), if there are any."""
+    """Return the rows of sources that queries exclude, as kernels read them (`native/decide/excluded.h`), if there are any."""
     return [] if search.exclude is None else [search.exclude.starts, search.exclude.names(search.sizes[0])]
 
 

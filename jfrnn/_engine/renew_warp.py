@@ -1,6 +1,6 @@
 """Lists with a skin on CUDA that renew themselves where they are stale: one call, which tells the host nothing.
 
-The device decides (`kernels/native/launch.h`): kernels say whether a point has moved too far, and what is launched behind them, a
+The device decides (`native/launch/launch.h`): kernels say whether a point has moved too far, and what is launched behind them, a
 search and what stands around it, runs if one has.
 """
 

@@ -17,7 +17,7 @@ from jfrnn.kernels.launch import write_launcher
 
 NATIVE = ROOT / "kernels" / "native"
 LAUNCHING = ("calls.h", "desk.h", "launch.h")  # which need XLA's header
-WHOLE = sorted(path.name for path in NATIVE.iterdir())
+WHOLE = sorted(path.name for path in NATIVE.rglob("*.*"))
 
 
 def is_cpu_only(header):
