@@ -113,10 +113,7 @@ class EdgeList(KeptSearch):
         with own_transfers():
             if 0 in (sources.shape[0], len(rows), self.total):
                 return no_edges(jnp.zeros((len(rows), 1), bool), self.source_count, sources, self.status, self.total)
-            present, by_receiver = self._sides(sources, rows, box)
-            if not self.skin:  # all pairs of the list are edges
-                present = dataclasses.replace(present, cutoff=None)
-            return edges_of(present, by_receiver, self.status)
+            return edges_of(*self._sides(sources, rows, box, decided=not self.skin), self.status)
 
     def to_jraph(self, positions: Points, box: Box | None = None) -> Graph:
         """Return the edges as a graph of jraph, as `NeighborList.to_jraph` does; jraph need not be installed.
@@ -158,12 +155,12 @@ class EdgeList(KeptSearch):
             return jnp.zeros(self.total, bool), None
         return close_edges(*self._sides(sources, rows, box))
 
-    def _sides(self, sources: Array, rows: Array, box: Box | None) -> tuple[Present, Topology]:
-        """Return the list at these positions, by its senders, and its receivers."""
+    def _sides(self, sources: Array, rows: Array, box: Box | None, decided: bool = False) -> tuple[Present, Topology]:
+        """Return the list at these positions, by its senders, and its receivers; `decided` as in `_present`."""
         codes = None if self.images is None else self.images.codes
         by_sender = self._side(self.senders, codes, self.reverse, self.source_count)
         by_receiver = self._side(self.receivers, None, edges_of_rows(self.offsets, self.total), self._row_count)
-        return self._present(by_sender, self.offsets[-1], sources, rows, box), by_receiver
+        return self._present(by_sender, self.offsets[-1], sources, rows, box, decided), by_receiver
 
     def _side(self, named: Array, codes: Array | None, reverse: Reverse | None, points: int) -> Topology:
         """Return the particles at one end of the edges, as a list of one slot per edge."""

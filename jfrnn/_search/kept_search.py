@@ -288,13 +288,19 @@ class KeptSearch(KeptOptions):
         reach = self.problem.reach(radii)
         return grow_images(self.box_kind, (box, self.box), reach, self.dtype, self.source_count, short)
 
-    def _present(self, topology: Topology, count: Array, sources: Array, rows: Array, box: Box | None) -> Present:
-        """Return the list at positions that are lengths, in the present box."""
-        cutoff = self.radii if self.cutoff is None else make_cutoff(self.cutoff, self.dtype, self.closed)
-        made = None if self.images is None or self.verlet is None else (self.verlet.positions, self.verlet.queries)
-        where = (None, None, None) if box is None else (box, self.batch, self.box_kind)
-        forward = self.half and where[2] is not None and where[2].counts_short
-        return Present(topology, count, (self.images, made), sources, rows, *where[:2], cutoff, where[2], self.closed, forward)
+    def _present(
+        self, topology: Topology, count: Array, sources: Array, rows: Array, box: Box | None, decided: bool = False
+    ) -> Present:
+        """Return the list at positions that are lengths, in the present box; `decided`: all of its pairs are pairs now."""
+        problem, images, closed, cutoff = self.problem, self.images, self.problem.options.closed, None
+        if not decided:
+            cutoff = self.radii if problem.cutoff is None else make_cutoff(problem.cutoff, problem.dtype, closed)
+        kind, batch, forward = None, None, False
+        if box is not None:
+            kind, batch = problem.options.images, self.batch
+            forward = problem.options.filter.later_only and kind is not None and kind.counts_short
+        made = None if images is None or self.verlet is None else (self.verlet.positions, self.verlet.queries)
+        return Present(topology, count, (images, made), sources, rows, box, batch, cutoff, kind, closed, forward)
 
     def _geometry_inputs(self, positions: Points, queries: Points | None, box: Box | None) -> tuple[Array, Array, Box | None]:
         """Return the present positions of sources and rows, as lengths, and the present box, after checking that they fit."""

@@ -148,8 +148,7 @@ def check_problem(asked: Asked) -> tuple["Problem", Inputs]:
     if box is not None and box.per_system and asked.batch is None:
         raise ValueError("box holds a box per system: pass batch=, the system of each particle (from 0 on; -1: in none of them).")
     images = None if box is None else images_of(box, reach, dtype, sources.shape[0])
-    given = {"periodic": box, "radii": radii, "batch": asked.batch, "excluding": asked.exclude}
-    features = Features(**{name: x is not None for name, x in given.items()})
+    features = Features(box is not None, asked.batch is not None, radii is not None, excluding=asked.exclude is not None)
     engine = choose_engine(parse_backend(asked.backend, ENGINES), sources, queries, features)
     systems = None if asked.batch is None else check_batch(asked.batch, sources, queries)
     ordered = has_order(engine, platform_of(sources), sources.shape[0], queries is None and radii is None)
