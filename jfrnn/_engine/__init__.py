@@ -34,6 +34,6 @@ from jfrnn._engine.rows import Found, add_up, count_rows, fold_pairs, list_flat,
 from jfrnn._engine.runs import FOLD_GROUP, Block, Slots, Visit
 from jfrnn._engine.start import compiler, level_of_caller
 from jfrnn._engine.structure import Structure, find_structure_pairs
-from jfrnn._engine.sum_results import FoundSums
+from jfrnn._engine.sum_results import FoundSums, Summed
 from jfrnn._engine.warp import PLATFORMS, has_order
 from jfrnn._engine.warp_sums import pair_sums

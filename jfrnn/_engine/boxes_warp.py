@@ -18,7 +18,7 @@ from jfrnn._engine.operands import (
 )
 from jfrnn._engine.plans import Clear, Launch, Plan, share
 from jfrnn._engine.problem import Filter, Room, Rows, Search, largest_radius
-from jfrnn._engine.sum_results import FoundSums, SumsOf, beside_rows, numbers_of_values
+from jfrnn._engine.sum_results import FoundSums, Summed, SumsOf, beside_rows, numbers_of_values
 from jfrnn._engine.variants import (
     SUMS,
     absent,
@@ -193,21 +193,13 @@ def _plan_on_cuda(kind: Kind, shapes: Shapes, _: int) -> Plan:
 # --- sums ----------------------------------------------------------------------------------------------------------------
 
 
-def box_sums(
-    search: Search,
-    keep: Filter,
-    term: TermText,
-    key: str,
-    values: tuple[Array, Array, Array],
-    compensated: bool,
-    extremes: bool,
-) -> FoundSums:
+def box_sums(search: Search, keep: Filter, summed: Summed, values: tuple[Array, Array, Array]) -> FoundSums:
     """Sum a term over the pairs of a search in which each system has a box of its own, as `jfrnn._engine.warp_sums.pair_sums`."""
     (n, m), (shared, own, others) = search.sizes, values
-    kind = kind_of_search(search, keep)._replace(later=False, compensated=compensated, extremes=extremes)
+    term, key, kind = summed.term, summed.key, summed.of(kind_of_search(search, keep))
 
     def on_cpu(search: Search, *values: Array) -> FoundSums:
-        results, scratch = SumsOf(term, m, pair_sum_cpu.slots(m), compensated, extremes), _scratch_dims(search)
+        results, scratch = SumsOf(term, kind, m, pair_sum_cpu.slots(m)), _scratch_dims(search)
         dims = (
             results.dims() | {"columns": max(pair_sum_cpu.sorted_numbers(term, n, kind.dim, kind.double), 1), "info": 2} | scratch
         )
@@ -215,7 +207,7 @@ def box_sums(
         return results.unpack(*_cpu_sum_callable(kind, term, key)(*given, output_dims=dims)[: len(SUMS)])
 
     def on_cuda(search: Search, shared: Array, own: Array, others: Array) -> FoundSums:
-        results, given = SumsOf(term, m, boxes.slots(m), compensated, extremes), _operands(search)
+        results, given = SumsOf(term, kind, m, boxes.slots(m)), _operands(search)
         ids = given[_GIVEN.index("ids")]
         given += [shared, own, _sorted_columns(search, term, others, ids)]
         given += [*excluded_rows(search), *_cutoffs_of_pairs(search, ids)]

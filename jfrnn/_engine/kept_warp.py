@@ -13,7 +13,7 @@ from jax import Array
 from jfrnn._engine.launch import Call, Shapes, kernel
 from jfrnn._engine.operands import lattice_numbers, periodic_kind
 from jfrnn._engine.plans import Clear, Launch, Plan, ask_for_huge_pages, share
-from jfrnn._engine.sum_results import FoundSums, SumsOf
+from jfrnn._engine.sum_results import FoundSums, Summed, SumsOf
 from jfrnn._engine.variants import scalar_of
 from jfrnn._geometry import EXCHANGED, LARGEST_TURN, Cutoff, Cutoffs, Lattice
 from jfrnn._tracing import on_platform
@@ -101,21 +101,14 @@ def kept_slopes(given: KeptList, slots: Array, distances: Array, slopes: Array) 
     return on_platform(given, slots, distances, slopes, cpu=on(False), cuda=on(True))
 
 
-def kept_sums(
-    given: KeptList,
-    term: TermText,
-    key: str,
-    values: tuple[Array, Array | None, Array],
-    compensated: bool,
-    apart: bool = False,
-    extremes: bool = False,
-) -> FoundSums:
+def kept_sums(given: KeptList, summed: Summed, values: tuple[Array, Array | None, Array], apart: bool = False) -> FoundSums:
     """Sum a term over the pairs of a list, as `jfrnn._engine.warp_sums.pair_sums` does over those of a search.
 
     `values` are what all pairs share, what is read of i, or None where that is of the same arrays as what is read of j, and what is
     read of j. `apart`: a particle's pair with itself, without a shift, is left out. An extreme has its place in the row
     in place of the code of an image.
     """
+    term = summed.term
     mirrored = values[1] is None
 
     def on(cuda: bool) -> Callable[[KeptList, tuple[Array, Array | None, Array]], FoundSums]:
@@ -124,10 +117,10 @@ def kept_sums(
             own = jnp.zeros((1, 1), given.sources.dtype) if own is None else own
             rows = (given.sources if given.reversal is not None else given.rows).shape[0]
             kind = _kind_of(given, cuda)._replace(apart=apart, mirrored=mirrored)
-            kind = kind._replace(kind=kind.kind._replace(compensated=compensated, extremes=extremes))
-            results = SumsOf(term, rows, kept.slots(rows, kind.lanes), compensated, extremes)
+            kind = kind._replace(kind=summed.of(kind.kind))
+            results = SumsOf(term, kind.kind, rows, kept.slots(rows, kind.lanes))
             operands = _operands(given, kind, term.columns, others)
-            written = _sum_callable(kind, term, key)(*operands, shared, own, output_dims=results.dims() | {"info": 2})
+            written = _sum_callable(kind, term, summed.key)(*operands, shared, own, output_dims=results.dims() | {"info": 2})
             return results.unpack(*written[:3])
 
         return call

@@ -11,7 +11,7 @@ from jfrnn._engine.launch import Call, Shapes, kernel
 from jfrnn._engine.operands import cutoffs_of_particles, excluded_rows, orders_for_tree, pack_particles
 from jfrnn._engine.plans import Launch, Plan, share
 from jfrnn._engine.problem import Filter, Search
-from jfrnn._engine.sum_results import FoundSums, SumsOf, TermText, beside_rows, numbers_of_values
+from jfrnn._engine.sum_results import FoundSums, Summed, SumsOf, TermText, beside_rows, numbers_of_values
 from jfrnn._engine.variants import SUMS, describe_sums, kind_of_search, names_of_tree, scalar_of, size_numbers, sort_on_cpu
 from jfrnn._engine.warp import QUERIES_PER_THREAD, are_few, by_cells_or_tree, fit_tree, place_launches
 from jfrnn._geometry import Cutoffs
@@ -22,28 +22,17 @@ _GIVEN = ("positions", "queries", "cutoff", "shared_values", "own_values", "othe
 _WORDS = {"info": np.int32, "scratch": np.int32}  # what is written where particles are sorted
 
 
-def pair_sums(
-    search: Search,
-    keep: Filter,
-    term: TermText,
-    key: str,
-    values: tuple[Array, Array, Array],
-    compensated: bool,
-    extremes: bool = False,
-) -> FoundSums:
-    """Sum a term (`jfrnn.kernels.pair_sum_cpu.TermText`, named by its key) with the columns that it reads.
+def pair_sums(search: Search, keep: Filter, summed: Summed, values: tuple[Array, Array, Array]) -> FoundSums:
+    """Sum a term over the pairs of a search, with the columns that it reads.
 
     Returns:
         The sums of each query [m, width], or the first of them and the others in two arrays; the sums over all pairs [totals]; and
-        for `extremes`, where sums are the largest summands, their sources and the codes of their images, int32 [m, width, 2].
+        for extremes, where sums are the largest summands, their sources and the codes of their images, int32 [m, width, 2].
     """
-    term = term._replace(first=0) if extremes else term
+    term, key, kind = summed.term, summed.key, summed.of(kind_of_search(search, keep))
+    term = term._replace(first=0) if kind.extremes or (kind.rule and not search.per_system) else term
     if search.per_system:
-        return box_sums(search, keep, term, key, values, compensated, extremes)
-    rule = search.cutoff.rule if isinstance(search.cutoff, Cutoffs) else ""
-    term = term._replace(first=0) if rule else term
-
-    kind = kind_of_search(search, keep)._replace(later=False, compensated=compensated, extremes=extremes)
+        return box_sums(search, keep, summed._replace(term=term), values)
 
     def on(cuda: bool, tree: bool = False) -> Callable[[Search, tuple[Array, Array, Array]], FoundSums]:
         def call(search: Search, values: tuple[Array, Array, Array]) -> FoundSums:
@@ -51,7 +40,7 @@ def pair_sums(
             more = [*excluded_rows(search), *of_particles.values()]
             if not cuda:
                 return _sum_on_cpu(kind, term, key, pack_particles(search), [*beside_rows(term, values), *more])
-            if not rule and are_few(search):
+            if not kind.rule and are_few(search):
                 return _sum_few(kind, term, key, [*pack_particles(search), *values, *more])
             orders = [*of_particles.values(), *orders_for_tree(search).values()] if tree else []
             particles = pack_particles(search)
@@ -60,8 +49,8 @@ def pair_sums(
 
         return call
 
-    cuda = functools.partial(by_cells_or_tree, on(True), on(True, True)) if rule else on(True)
-    return on_platform(search._replace(checks={}), values, late=bool(rule), cpu=on(False), cuda=cuda)
+    cuda = functools.partial(by_cells_or_tree, on(True), on(True, True)) if kind.rule else on(True)
+    return on_platform(search._replace(checks={}), values, late=bool(kind.rule), cpu=on(False), cuda=cuda)
 
 
 Particles = tuple[Array, Array, Array]  # rows of sources and of queries, and the shared numbers
@@ -70,7 +59,7 @@ Particles = tuple[Array, Array, Array]  # rows of sources and of queries, and th
 def _sum_on_cpu(kind: Kind, term: TermText, key: str, particles: Particles, given: list[Array]) -> FoundSums:
     """Let XLA call the kernels that sort and sum; `given` are values, rows of exclusions, and cutoffs that differ."""
     n, m = len(particles[0]), len(particles[1])
-    results = SumsOf(term, m, pair_sum_cpu.slots(m), kind.compensated, kind.extremes)
+    results = SumsOf(term, kind, m, pair_sum_cpu.slots(m))
     words = (tree_cpu if kind.rule else cells_cpu).scratch_words(n, m, kind.dim, 2 if kind.double else 1, kind.own)
     dims = results.dims() | {"columns": max(pair_sum_cpu.sorted_numbers(term, n, kind.dim, kind.double), 1)}
     found = _cpu_callable(kind, term, key)(*particles, *given, output_dims=dims | {"info": 2, "scratch": words})
@@ -79,7 +68,7 @@ def _sum_on_cpu(kind: Kind, term: TermText, key: str, particles: Particles, give
 
 def _sum_few(kind: Kind, term: TermText, key: str, given: list[Array]) -> FoundSums:
     m = len(given[1])
-    results = SumsOf(term, m, few_cuda.slots(m), kind.compensated, kind.extremes)
+    results = SumsOf(term, kind, m, few_cuda.slots(m))
     return results.unpack(*_few_callable(kind, term, key)(*given, output_dims=results.dims()))
 
 
@@ -97,7 +86,7 @@ def sort_particles(kind: Kind, particles: Particles, orders: list[Array]) -> Seq
 def _sum_on_cuda(kind: Kind, term: TermText, key: str, particles: Particles, given: list[Array]) -> FoundSums:
     """Let XLA call the kernels that sum over sorted particles."""
     n, m = len(particles[0]), len(particles[1])
-    results = SumsOf(term, m, pair_sum_cuda.slots(m), kind.compensated, kind.extremes)
+    results = SumsOf(term, kind, m, pair_sum_cuda.slots(m))
     dims = results.dims() | {"values": max(pair_sum_cuda.sorted_numbers(term, n, kind.dim, kind.double), 1)}
     return results.unpack(*_cuda_callable(kind, term, key)(*particles, *given, output_dims=dims)[: len(SUMS)])
 
