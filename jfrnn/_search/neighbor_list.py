@@ -140,8 +140,8 @@ class NeighborList(ListExports):
             if box is None or self.box_kind is None or 0 in (sources.shape[0], *self.idx.shape):
                 return self._mark(jnp.zeros((*self.idx.shape, sources.shape[1]), jnp.int32))
             present = self._at(sources, rows, box)
-            # few slots take the program of `vectors`, so that they share one
-            found = vectors_of(present, as_given=True)[2] if self.idx.size <= _FEW_SLOTS else lattice_shifts(present)
+            # few slots take the program of `vectors`, called in the same way, so that they share one
+            found = vectors_of(present, True)[2] if self.idx.size <= _FEW_SLOTS else lattice_shifts(present)
             assert found is not None
             return self._mark(found)
 
