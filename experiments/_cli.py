@@ -31,7 +31,6 @@ class Bench(_commands.Commands):
     there = {  # noqa: RUF012
         name.removesuffix("_report"): (f"experiments.bench.{name}", "command", text)
         for name, text in {
-            "crossover": "Time the backends over sizes.",
             "crystals": "Time batches of crystals in cells of their own.",
             "distributed": "Time lists, sums and fluids on 1 to k devices.",
             "arrays": "Time the array engine beside jax-md.",

@@ -21,12 +21,8 @@ MOST = 8  # methods in a picture
 WIDTH = 7.0  # of a picture that is to be read when it is 700 pixels wide [inches]
 NAMES = {  # of our methods, those that lead first
     **{"warp": "jfrnn, list", "pair-sum": "jfrnn, pair_sum", "jax": "jfrnn, engine jax", "warp-update": "jfrnn, kept list"},
-    **{
-        "warp-rebuild": "jfrnn, list anew",
-        "warp-counts": "jfrnn, counts",
-        "hashgrid": "jfrnn, engine hashgrid",
-        "brute": "jfrnn, brute",
-    },
+    **{"warp-rebuild": "jfrnn, list anew", "warp-counts": "jfrnn, counts", "hashgrid": "jfrnn, engine hashgrid"},
+    **{"brute": "jfrnn, brute"},
 }
 PEERS = {  # of others, those first that people know best
     **{"cll": "cell lists (thesis)", "vesin": "vesin", "scipy-kdtree": "SciPy's cKDTree", "nvalchemi": "nvalchemi"},

@@ -1,4 +1,4 @@
-"""The report of a sweep: reads its rows and nothing else; prints a short table, writes report.md, table.csv and pictures."""
+"""The report of a sweep: reads its rows and nothing else; prints a short table, writes table.csv and pictures."""
 
 import csv
 import math
@@ -15,42 +15,12 @@ from experiments import _table, methods
 from experiments._errors import UsageError
 from experiments._rows import SearchRow, read_latest
 
-TITLES = ("scene", "points", "method", "s", "±", "/ {}", "MB", "/ {}", "missing", "extra", "density error", "gradient error")
-TITLES += ("thesis", "s", "/ CLL", "MB", "/ CLL")
-TEXT_COLUMNS = ("scene", "method", "thesis")
 PRINTED = ("s", "MB", "missing", "extra")
 ABSENT = "·"
 
-NOTES = """\
-- **s**: median time of a search, from raw positions to the finished result, without compilation; of several processes the median of
-  their medians.
-- **±**: half the interval that holds the median with a probability of 95 %, in per cent of it; five processes can tell 93.75 % at
-  most, four 87.5 %, three 75 %. It belongs to the medians of several processes, or, in brackets, to the repeats of one.
-  table.csv tells how many there are of each.
-- **MB**: peak resident memory of the process during its first search, over what was resident after compilation; 10^6 bytes. On a
-  GPU the peak of its memory over what it held at first: positions, list and scratch, or what the compiler tried out, if that is
-  more.
-- **/ cll**, or another method's name in a sweep that has no `cll`: divided by the row of that method on the same scene, process by
-  process of the same round on the same kind of machine. `≈`: within noise: the interval of that ratio holds 1 (of one process: the
-  intervals of both overlap). `?`: fewer than three such rounds, or repeats too few to tell.
-- **missing**, **extra**: unordered pairs against the exact answer on the given floats, distance < cutoff. A method without a pair
-  list (`~`) shows only the surplus and the deficit of each particle. Among more than two million particles (`~`, too), 20 000 are
-  compared.
-- **density error**, **gradient error**: of a poly6 density over the neighbors that were found and of its gradient, the largest of
-  all particles, over the mean density, and over that per cutoff; `pair-sum` makes such a density itself.
-- **thesis**: Table 6.1 of J. Peifle, Implementation of a Nearest-Neighbor Search for Particle Simulation in Sparse Computational
-  Domains, KIT, February 2019: the method closest to ours, its total time, the largest resident set of its process, and both
-  divided by its own CLL. Its machine was another, so only ratios compare.
-- `warp`, `pair-sum`, `jax`, `brute`, `freud`, `pykdtree` and what runs inside JAX may use all cores, the others one thread. Lists
-  hold each pair once or in both directions, as the method gives them.
-- `*`: other processes kept more than a quarter of a core busy meanwhile (`others_cores` in table.csv). Methods on all cores then
-  look slower than they are. `°`: the repeats took too little time together to tell whether other processes worked.
-- table.csv holds all times, compilation included; rows.jsonl all that was measured.
-"""
-
 
 def report(folder: Path) -> None:
-    """Print the table of a sweep and the paths of its files: report.md, table.csv and the pictures, beside the rows.
+    """Print the table of a sweep and the paths of its files: table.csv and the pictures, beside the rows.
 
     Raises:
         UsageError: The folder holds no rows.
@@ -62,20 +32,18 @@ def report(folder: Path) -> None:
 
     lines = _table.lines(rows)
     pictures = _plots.draw_all(_statistics.summarize(rows), folder, describe_origin(rows))
-    write_csv(lines, folder / "table.csv")
-    (folder / "report.md").write_text(markdown(rows, lines, pictures), encoding="utf-8")
+    with (folder / "table.csv").open("w", encoding="utf-8", newline="") as stream:
+        writer = csv.DictWriter(stream, _table.COLUMNS)
+        writer.writeheader()
+        writer.writerows(lines)
     console = Console(highlight=False, markup=False)
     if not console.is_terminal:
         console.width = 80
     console.print(rich_table(lines))
     for text in (*remarks(lines), describe_origin(rows)):
         console.print(text, soft_wrap=True)
-    for path in (folder / "report.md", folder / "table.csv", *pictures):
+    for path in (folder / "table.csv", *pictures):
         console.print(str(path), soft_wrap=True)
-
-
-def _title(rows: list[SearchRow]) -> str:
-    return ", ".join(_distinct(row.config or "" for row in rows)) or "rows"
 
 
 def describe_origin(rows: Iterable[SearchRow]) -> str:
@@ -102,39 +70,12 @@ def _describe_machine(machine: dict[str, Any]) -> str:
     return f"{machine.get('cpu')}, {machine.get('cores')} cores{size}"
 
 
-def titles(lines: list[dict[str, Any]]) -> list[str]:
-    """Return the titles of the columns, with the name of the method that ratios divide by."""
-    return [title.format(lines[0]["yardstick"]) for title in TITLES]
-
-
-def cells(line: dict[str, Any]) -> list[str]:
-    """Return what the printed table shows of a line, a text per entry of `TITLES`."""
-    return [
-        *(line["scene"], _count(line["points"]), line["method"]),
-        *(
-            _table.busy_mark(line) + _seconds(line["median_s"]),
-            _spread(line),
-            _table.noise_mark(line) + _ratio(line["seconds_ratio"]),
-            _megabytes(line["search_mb"]),
-            _ratio(line["mb_ratio"]),
-        ),
-        *(_errors(line, "missing"), _errors(line, "extra"), _relative(line["density_error"]), _relative(line["gradient_error"])),
-        line["thesis_method"] or ABSENT,
-        *(_seconds(line["thesis_s"], 2), _ratio(line["thesis_s_to_cll"])),
-        *(_megabytes(line["thesis_mb"]), _ratio(line["thesis_mb_to_cll"])),
-    ]
-
-
 def _count(value: int | None) -> str:
     return ABSENT if value is None else _table.count(value)
 
 
 def _errors(line: dict[str, Any], name: str) -> str:
     return _table.pairs_mark(line) + _count(line[name])
-
-
-def _relative(value: float | None) -> str:
-    return ABSENT if value is None else f"{value:.1e}" if value else "0"
 
 
 def _seconds(value: float | None, digits: int = 4) -> str:
@@ -145,28 +86,14 @@ def _seconds(value: float | None, digits: int = 4) -> str:
     return f"{value:.{digits}f}"
 
 
-def _spread(line: dict[str, Any]) -> str:
-    """Return half the interval of the median in per cent, in brackets where it is that of one process."""
-    if line["low_s"] is None or not line["median_s"] or not line["confidence"]:
-        return ABSENT
-    text = f"{50 * (line['high_s'] - line['low_s']) / line['median_s']:.1f} %"
-    return text if line["processes"] > 1 else f"({text})"
-
-
 def _megabytes(value: float | None) -> str:
     return ABSENT if value is None else f"{value:.1f}"
-
-
-def _ratio(value: float | None) -> str:
-    if value is None:
-        return ABSENT
-    return f"{value:.3g}" if value < 1000 else f"{value:.0f}"
 
 
 def rich_table(lines: list[dict[str, Any]]) -> Table:
     """Return the printed table, scene by scene: what has figures, or says why it has none, but for what is not installed.
 
-    It fits a terminal of 80 columns, where long names of scenes are broken; `report.md` has more columns, and `table.csv` all.
+    It fits a terminal of 80 columns, where long names of scenes are broken; `table.csv` has all columns.
     """
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
     table.add_column("")
@@ -204,38 +131,3 @@ def remarks(lines: list[dict[str, Any]]) -> list[str]:
     if any(_table.pairs_mark(line) for line in lines):
         said.append("~: told from counts of neighbors, or from a sample of the particles")
     return [*said, "s: median time of a search; MB: its peak memory, 10^6 bytes; missing, extra: pairs against the exact answer"]
-
-
-def write_csv(lines: list[dict[str, Any]], path: Path) -> None:
-    """Write the lines with all their columns."""
-    with path.open("w", encoding="utf-8", newline="") as stream:
-        writer = csv.DictWriter(stream, _table.COLUMNS)
-        writer.writeheader()
-        writer.writerows(lines)
-
-
-def markdown(rows: list[SearchRow], lines: list[dict[str, Any]], pictures: list[Path]) -> str:
-    """Return report.md."""
-    head = [" | ".join(titles(lines)), " | ".join(":---" if title in TEXT_COLUMNS else "---:" for title in TITLES)]
-    shown, absent = split_absent(lines)
-    body = [" | ".join(cells(line)) for line in shown]
-    table = [f"| {text} |" for text in (*head, *body)]
-    failed = [(line, f"{line['status']}: " if line["status"] != "ok" else "") for line in shown if line["reason"]]
-    unfinished = [f"- {line['scene']}, {line['method']}: {status}{line['reason']}" for line, status in failed]
-    reasons = ["## Rows, and processes of them, without figures", "", *unfinished, ""] if unfinished else []
-    images = [f"![{path.stem.replace('_', ' ')}]({path.name})" for path in pictures]
-    return "\n".join(
-        [
-            f"# Sweep {_title(rows)}",
-            "",
-            describe_origin(rows),
-            "",
-            *table,
-            "",
-            *(f"{text}\n" for text in absent),
-            NOTES,
-            *reasons,
-            *images,
-            "",
-        ]
-    )

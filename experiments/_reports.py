@@ -9,21 +9,23 @@ import typer
 
 from experiments._rows import RowFile, SearchRow, read_text
 
-_KINDS = (  # columns by which rows are known, the module of their kind and its name, and that of their report
-    ({"figures", "curves"}, "sph.validate", "CaseRow", "sph.validate"),
-    ({"particle_steps_per_s", "way"}, "sph.speed", "StepRow", "sph.speed_report"),
-    ({"compensated", "way"}, "bench.sums", "SumRow", "bench.sums_report"),
-    ({"scaling", "halo"}, "bench.distributed", "DeviceRow", "bench.distributed"),
+_KINDS = (  # columns by which rows are known, the module of their report, and, where they are no dicts, of their kind and its name
+    ({"figures", "curves"}, "sph.validate", ("sph.validate", "CaseRow")),
+    ({"particle_steps_per_s", "way"}, "sph.speed_report", ("sph.speed", "StepRow")),
+    ({"compensated", "way"}, "bench.sums_report", ("bench.sums", "SumRow")),
+    ({"scaling", "devices"}, "bench.distributed", None),
+    ({"kind"}, "bench.table", None),
 )
 
 
 def kind_of(folder: Path) -> tuple[Any, str]:
-    """Return the kind of the rows of a folder, and the module of their report; those of a GPU run are dicts of any columns."""
+    """Return the kind of the rows of a folder, and the module of their report."""
     columns = _columns(folder / "rows.jsonl")
-    for known, module, name, table in _KINDS:
+    for known, report, kind in _KINDS:
         if known <= columns:
-            return getattr(import_module(f"experiments.{module}"), name), f"experiments.{table}"
-    return (dict, "experiments.gpu.report") if "kind" in columns else (SearchRow, "experiments._report")
+            made = dict if kind is None else getattr(import_module(f"experiments.{kind[0]}"), kind[1])
+            return made, f"experiments.{report}"
+    return SearchRow, "experiments._report"
 
 
 def report(folder: Path) -> None:
@@ -33,7 +35,7 @@ def report(folder: Path) -> None:
     if kind is SearchRow:
         table(folder)
     else:
-        typer.echo(table(folder) if kind is dict else table(RowFile(folder, kind).read(), folder))
+        typer.echo(table(RowFile(folder, kind).read(), folder))
 
 
 def _columns(path: Path) -> set[str]:

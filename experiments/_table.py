@@ -14,26 +14,12 @@ YARDSTICKS = ("cll", "warp", "warp-counts", "warp-rebuild")
 NOTEWORTHY_CORES = 0.25  # what other processes take beyond it is said: it slows down the methods that use all cores
 PARTS = ("t_tree", "t_ksearch", "t_frsearch", "t_processing")
 COLUMNS = (
-    *(
-        "scene",
-        "layout",
-        "fill_asked",
-        "fill",
-        "points",
-        "spacing",
-        "cutoff_ratio",
-        "dim",
-        "dtype",
-        "seed",
-        "angle",
-        "growth",
-        "order",
-    ),
-    *("motion", "method", "status", "reason", "processes", "repeats", "allocate_s", "compile_s", "first_s", "median_s", "low_s"),
-    *("high_s", "confidence", "p10_s", "p90_s", *PARTS, "rebuilt", "others_cores", "yardstick", "seconds_ratio", "within_noise"),
-    *("search_mb", "list_mb", "scratch_mb", "peak_mb", "device_mb", "planned_list_mb", "planned_scratch_mb", "mb_ratio"),
-    *("pairs", "missing", "extra", "compared", "density_error", "gradient_error", "jump_error"),
-    *("thesis_method", "thesis_points", "thesis_s", "thesis_s_to_cll", "thesis_mb", "thesis_mb_to_cll"),
+    *("scene", "layout", "fill_asked", "fill", "points", "spacing", "cutoff_ratio", "dim", "dtype", "seed", "angle", "growth"),
+    *("order", "motion", "method", "status", "reason", "processes", "repeats", "allocate_s", "compile_s", "first_s"),
+    *("median_s", "low_s", "high_s", "confidence", "p10_s", "p90_s", *PARTS, "rebuilt", "others_cores", "yardstick"),
+    *("seconds_ratio", "within_noise", "search_mb", "list_mb", "scratch_mb", "peak_mb", "device_mb", "planned_list_mb"),
+    *("planned_scratch_mb", "mb_ratio", "pairs", "missing", "extra", "compared", "density_error", "gradient_error"),
+    *("jump_error", "thesis_method", "thesis_points", "thesis_s", "thesis_s_to_cll", "thesis_mb", "thesis_mb_to_cll"),
 )
 
 
@@ -89,14 +75,6 @@ def count(value: int) -> str:
     return f"{value:,}".replace(",", " ")
 
 
-def markdown(lines: Sequence[dict[str, Any]]) -> str:
-    """Return lines with the same keys as a table in Markdown."""
-    if not lines:
-        return "No rows."
-    cells = [list(lines[0]), ["---"] * len(lines[0]), *(map(str, line.values()) for line in lines)]
-    return "\n".join(f"| {' | '.join(line)} |" for line in cells)
-
-
 def ratio(value: float | None, yardstick: float | None) -> float | None:
     """Return value / yardstick, None where either is unknown or there is nothing to divide by."""
     return value / yardstick if value is not None and yardstick else None
@@ -112,13 +90,6 @@ def busy_mark(line: dict[str, Any]) -> str:
     if line["median_s"] is None:
         return ""
     return "°" if line["others_cores"] is None else "*" if line["others_cores"] > NOTEWORTHY_CORES else ""
-
-
-def noise_mark(line: dict[str, Any]) -> str:
-    """Return what stands before the ratio of times of a line: whether it is within noise."""
-    if line["method"] == line["yardstick"] or line["seconds_ratio"] is None:
-        return ""
-    return {True: "≈", False: "", None: "?"}[line["within_noise"]]
 
 
 def _line(row: Summary, scene: str, other: Summary | None) -> dict[str, Any]:

@@ -4,10 +4,10 @@
 twelve edges, 8 to 64 atoms each, and cutoffs at which shells of neighbors lie. All get the same numbers in float64.
 """
 
+import importlib
 import itertools
 import sys
 from collections.abc import Callable, Iterator
-from fractions import Fraction
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any, NamedTuple
 
@@ -46,18 +46,10 @@ def crystals() -> Iterator[Crystal]:
 
 
 def exact_pairs(given: Crystal) -> tuple[Found, int]:
-    """Return the pairs closer than the cutoff, and how many are within rounding of it: of these, rational numbers decide."""
-    edges, reach = np.diag(given.cell), int(np.ceil(given.cutoff / given.cell[0, 0])) + 1
-    shifts = np.array(list(itertools.product(range(-reach, reach + 1), repeat=3)))
-    away = given.x[None, :, None] - given.x[:, None, None] + shifts * edges
-    excess = np.square(away).sum(axis=-1) - given.cutoff**2
-    near, doubtful = excess < 0, np.argwhere(np.abs(excess) < 1e-9 * given.cutoff**2)
-    for i, j, k in doubtful:
-        parts = [Fraction(b) - Fraction(a) for a, b in zip(given.x[i].tolist(), given.x[j].tolist(), strict=True)]
-        parts = [part + int(s) * Fraction(edge) for part, s, edge in zip(parts, shifts[k], edges.tolist(), strict=True)]
-        near[i, j, k] = sum(part**2 for part in parts) < Fraction(given.cutoff) ** 2
-    found = {(int(i), int(j), *shifts[k].tolist()) for i, j, k in np.argwhere(near)}
-    return {pair for pair in found if pair[0] != pair[1] or any(pair[2:])}, len(doubtful)
+    """Return the pairs closer than the cutoff, as the oracle of the tests has them, and how many are within rounding of it."""
+    images = importlib.import_module("tests.reference").reference_images
+    found = [images(given.x, given.cutoff * (1 + off), matrix=given.cell, periodic=(True,) * 3) for off in (0, 5e-10, -5e-10)]
+    return {(i, j, *shift) for i, j, shift in found[0]}, len(found[1] - found[2])
 
 
 def libraries() -> dict[str, tuple[str, Callable[[Crystal], Any]]]:

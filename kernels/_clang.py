@@ -15,7 +15,8 @@ _NAMES = {"win32": ("warp.dll", "warp-clang.dll"), "darwin": ("libwarp.dylib", "
 _LINUX = ("warp.so", "warp-clang.so")
 _TEXT, _FLAG, _NUMBER = ctypes.c_char_p, ctypes.c_bool, ctypes.c_int
 # What Warp compiles kernels with: all instructions of this processor, and functions that are inlined wherever they are called.
-OPTIONS = ("-march=native", "-mllvm", "-inline-threshold=9000", "-mllvm", "-inline-cold-callsite-threshold=3000")
+NATIVE = ("-march=native",)
+OPTIONS = (*NATIVE, "-mllvm", "-inline-threshold=9000", "-mllvm", "-inline-cold-callsite-threshold=3000")
 OPTIONS += ("-mllvm", "-slp-recursion-max-depth=4")
 _COMPILED_WITH = (_TEXT, _TEXT, _TEXT, _TEXT, _FLAG, _FLAG, _FLAG, _FLAG, ctypes.c_void_p, _NUMBER, _FLAG, _FLAG, _TEXT, _NUMBER)
 
@@ -78,7 +79,7 @@ def _library() -> ctypes.CDLL:
     return clang
 
 
-def compile_object(text: str, source: Path, target: Path, fused: bool) -> None:
+def compile_object(text: str, source: Path, target: Path, fused: bool, inlined: bool) -> None:
     """Compile C++ for this processor.
 
     Args:
@@ -86,12 +87,14 @@ def compile_object(text: str, source: Path, target: Path, fused: bool) -> None:
         source: Its file, of which messages speak.
         target: The object file that is written.
         fused: Whether products may be contracted with sums.
+        inlined: Whether large functions, too, become part of those that call them.
 
     Raises:
         RuntimeError: It does not compile.
     """
+    chosen = OPTIONS if inlined else NATIVE
     files = str(source).encode(), str(warp_root() / "native").encode(), str(target).encode()
-    flags = (ctypes.c_char_p * (len(OPTIONS) + 1))(*(option.encode() for option in OPTIONS), None)
+    flags = (ctypes.c_char_p * (len(chosen) + 1))(*(option.encode() for option in chosen), None)
     options = False, False, fused, True, ctypes.addressof(flags), 2, False, False, None, 256
     if _library().wp_compile_cpp(text.encode(), *files, *options):
         raise RuntimeError("see what Clang says on standard error")

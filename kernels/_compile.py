@@ -205,7 +205,7 @@ def _processor() -> str:
 
 def _build_object(program: Program, source: Path) -> Path:
     binary = source.with_suffix(".o")
-    _clang.compile_object(program.text, source, binary, program.fused)
+    _clang.compile_object(program.text, source, binary, program.fused, program.inlined)
     return binary
 
 

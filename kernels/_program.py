@@ -28,12 +28,17 @@ _LINE = re.compile(r"^\s*(?:const )?(real|int|whole)\b(.*);$")
 
 
 class Program(NamedTuple):
-    """A text that is compiled as a whole, for the CPU or for CUDA; `fused`: products may be contracted with sums."""
+    """A text that is compiled as a whole, for the CPU or for CUDA.
+
+    `fused`: products may be contracted with sums. `inlined`: large functions, too, become part of those that call them, as loops
+    over many pairs want it (CPU).
+    """
 
     name: str
     text: str
     cuda: bool
     fused: bool = False
+    inlined: bool = True
 
 
 class Field(NamedTuple):

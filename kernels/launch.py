@@ -30,4 +30,6 @@ def write_launcher(header: str, file: str = "launch.h") -> str:
 
 def launcher(header: str) -> Program:
     """Return the program, with the functions `open_desk`, `answer_on_cpu`, `answer_on_cuda`, `keep_plan` and `drop_plan`."""
-    return Program("launch", write_launcher(header), cuda=False)
+    return Program(
+        "launch", write_launcher(header), cuda=False, inlined=False
+    )  # everybody waits for it, and it has no loop over pairs

@@ -37,13 +37,7 @@ def is_pair(a: Any, b: Any, cutoff: float, *, closed: bool = False) -> bool:
 
 
 def reference_pairs(
-    positions: Any,
-    cutoff: float,
-    *,
-    queries: Any = None,
-    half: bool = False,
-    include_self: bool = False,
-    closed: bool = False,
+    positions: Any, cutoff: float, *, queries: Any = None, half: bool = False, include_self: bool = False, closed: bool = False
 ) -> set[Pair]:
     """Return every (query i, source j) with |x_j - x_i| < cutoff (closed: <=), exactly.
 

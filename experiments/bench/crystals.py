@@ -12,13 +12,12 @@ import typer
 from jax import Array
 
 import jfrnn
-from experiments import _machine, _measure
+from experiments import _measure
 from experiments._library import round_capacity
 from experiments.bench import table
 
 SIZES = ("1x32", "16x64", "64x100", "256x100", "64x1000")
 CUTOFF, DENSITY = 5.0, 0.1  # Å, atoms/Å³
-ROUNDED = 1e-3  # share of the particles whose counts of a peer may differ: its distances are rounded
 COLUMNS = (
     *("platform", "systems", "atoms", "who", "what", "pairs", "images", "waited_ms", "repeats", "wrong", "status", "reason"),
     *("others_cores", "device", "jax", "warp", "peer", "commit", "dirty"),
@@ -39,16 +38,6 @@ class _Scene(NamedTuple):
     def capacity(self) -> int:
         """Slots of a row."""
         return round_capacity(int(self.counts.max()))
-
-
-class _Way(NamedTuple):
-    """Who does what: `make` returns a call, and what reads the counts of its result."""
-
-    who: str
-    what: str
-    make: Callable[[_Scene], tuple[Callable[[], Any], Callable[[Any], np.ndarray]]]
-    method: str | None = None
-    package: str = "jfrnn"
 
 
 def command(
@@ -77,27 +66,17 @@ def _read_size(size: str) -> tuple[int, int]:
 def _rows(systems: int, atoms: int, repeats: int) -> Iterator[table.Line]:
     """Yield a row for each way; those whose answers are right are timed in turns."""
     scene, calls, rows = _make_scene(systems, atoms), dict[str, Callable[[], Any]](), dict[str, table.Line]()
+    told = {"systems": systems, "atoms": atoms, "pairs": int(scene.counts.sum()), "images": str(scene.images or "nearest")}
     for way in _ways():
         name = f"{way.who} {way.what}"
-        row: table.Line = {"systems": systems, "atoms": atoms, "who": way.who, "what": way.what, "pairs": int(scene.counts.sum())}
-        rows[name] = row | {"images": str(scene.images or "nearest")}
-        answer = table.ask(rows[name], way.method, functools.partial(_answer, way, scene))
-        if answer is None:
-            continue
-        call, wrong = answer
-        rows[name]["peer"] = _machine.versions([way.package]).get(way.package)
-        if table.judge(rows[name], wrong, 0 if way.method is None else ROUNDED * len(scene.x)):
-            calls[name] = call
+        rows[name] = dict(told)
+        ready = table.judge(rows[name], way, scene, lambda call: call)
+        if ready is not None:
+            calls[name] = ready.call
     seconds, others = _measure.time_in_turns(calls, repeats)
     for name, each in seconds.items():
         rows[name] |= {"waited_ms": 1e3 * float(np.median(each)), "repeats": repeats, "others_cores": others}
     yield from rows.values()
-
-
-def _answer(way: _Way, scene: _Scene) -> tuple[Callable[[], Any], int]:
-    """Return a call, and for how many atoms its answer is wrong."""
-    call, read = way.make(scene)
-    return call, int((read(call()) != scene.counts).sum())
 
 
 def _make_scene(systems: int, atoms: int) -> _Scene:
@@ -125,15 +104,20 @@ def _count(x: np.ndarray, cell: np.ndarray) -> np.ndarray:
 # --- who does what ------------------------------------------------------------------------------------------------------------
 
 
-def _ways() -> Iterator[_Way]:
-    yield _Way("jfrnn", "counts", functools.partial(_ours, lists=False))
-    yield _Way("jfrnn", "list", functools.partial(_ours, lists=True))
-    yield _Way("nvalchemi", "list", _nvalchemi, "nvalchemi", "nvalchemi-toolkit-ops")
+def _ways() -> Iterator[table.Way]:
+    yield table.Way("jfrnn", "counts", functools.partial(_ours, lists=False), lambda scene, found: _wrong(scene, found[0]))
+    yield table.Way("jfrnn", "list", functools.partial(_ours, lists=True), lambda scene, found: _wrong(scene, found[0]))
+    of_rows = lambda scene, found: _wrong(scene, found[1])  # noqa: E731
+    yield table.Way("nvalchemi", "list", _nvalchemi, of_rows, "nvalchemi", "nvalchemi-toolkit-ops")
     if jax.default_backend() == "cpu":
-        yield _Way("vesin", "list", _vesin, "vesin", "vesin")
+        yield table.Way("vesin", "list", _vesin, _wrong_of_pairs, "vesin", "vesin")
 
 
-def _ours(scene: _Scene, lists: bool) -> tuple[Callable[[], Any], Callable[[Any], np.ndarray]]:
+def _wrong(scene: _Scene, counts: Any) -> int:  # noqa: ANN401
+    return int((np.asarray(counts) != scene.counts).sum())
+
+
+def _ours(scene: _Scene, lists: bool) -> Callable[[], Any]:
     def find(x: Array, batch: Array, cells: Array) -> list[Array]:
         box = jfrnn.Box(cells, images=scene.images)
         if not lists:
@@ -142,10 +126,10 @@ def _ours(scene: _Scene, lists: bool) -> tuple[Callable[[], Any], Callable[[Any]
         return [nbrs.count, nbrs.idx, *([] if nbrs.images is None else [nbrs.images.codes])]
 
     compiled, given = jax.jit(find), [jnp.asarray(part) for part in (scene.x, scene.batch, scene.cells)]
-    return lambda: jax.block_until_ready(compiled(*given)), lambda found: np.asarray(found[0])
+    return lambda: compiled(*given)
 
 
-def _nvalchemi(scene: _Scene) -> tuple[Callable[[], Any], Callable[[Any], np.ndarray]]:
+def _nvalchemi(scene: _Scene) -> Callable[[], Any]:
     from nvalchemiops.jax.neighbors.batch_naive import batch_naive_neighbor_list  # pyright: ignore
     from nvalchemiops.jax.neighbors.neighbor_utils import compute_naive_num_shifts  # pyright: ignore
 
@@ -156,18 +140,17 @@ def _nvalchemi(scene: _Scene) -> tuple[Callable[[], Any], Callable[[Any], np.nda
     known |= {"max_atoms_per_system": atoms, "max_neighbors": scene.capacity, "batch_ptr": starts, "pbc": periodic}
     compiled = jax.jit(lambda x, batch, cells: batch_naive_neighbor_list(x, CUTOFF, batch_idx=batch, cell=cells, **known)[:3])
     given = [jnp.asarray(part) for part in (scene.x, scene.batch, scene.cells)]
-    return lambda: jax.block_until_ready(compiled(*given)), lambda found: np.asarray(found[1])
+    return lambda: compiled(*given)
 
 
-def _vesin(scene: _Scene) -> tuple[Callable[[], Any], Callable[[Any], np.ndarray]]:
+def _vesin(scene: _Scene) -> Callable[[], Any]:
     from vesin import NeighborList  # pyright: ignore
 
     find, systems = NeighborList(cutoff=CUTOFF, full_list=True), len(scene.cells)
     each = list(zip(scene.x.astype(float).reshape(systems, -1, 3), scene.cells.astype(float), strict=True))
+    return lambda: [find.compute(points=x, box=cell, periodic=True, quantities="ijS") for x, cell in each]
 
-    def call() -> list[Any]:
-        return [find.compute(points=x, box=cell, periodic=True, quantities="ijS") for x, cell in each]
 
-    return call, lambda found: np.concatenate(
-        [np.bincount(i, minlength=len(x)) for (i, *_), (x, _) in zip(found, each, strict=True)]
-    )
+def _wrong_of_pairs(scene: _Scene, found: list[Any]) -> int:
+    atoms = len(scene.x) // len(scene.cells)
+    return _wrong(scene, np.concatenate([np.bincount(i, minlength=atoms) for i, *_ in found]))

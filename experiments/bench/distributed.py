@@ -5,10 +5,9 @@ import math
 import os
 import re
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -22,10 +21,8 @@ from pydantic import Field, FiniteFloat
 import jfrnn
 from experiments import _machine, _measure
 from experiments._commands import RetryFailed, RowsFolder, take_folder
-from experiments._config import Dtype, Keyed, Positive, Table, load
-from experiments._library import Name
-from experiments._loop import Task, fill
-from experiments._rows import RowFile, TimedRow
+from experiments._config import Dtype, Positive, Table, load
+from experiments.bench import table
 from jfrnn import distributed
 
 _SENDS = re.compile(r"= (.*?) collective-permute(?:-start)?\((.*?)\),.*?source_target_pairs=\{(.*?)\}\}")
@@ -55,56 +52,23 @@ class Config(Table):
 
     def specs(self) -> Iterator["Spec"]:
         """Yield the rows, those of one kind of work side by side."""
-        shared = self.model_dump(exclude={"devices", "scaling", "work", "axes", "virtual_devices"})
-        for scaling, work, axes in itertools.product(self.scaling, self.work, self.axes):
-            yield from (Spec(scaling=scaling, work=work, axes=axes, devices=devices, **shared) for devices in self.devices)
+        yield from (Spec(self, *each) for each in itertools.product(self.scaling, self.work, self.axes, self.devices))
 
 
-@dataclass(frozen=True)
-class Spec(Keyed):
-    """What one row measures, and how: fields as in `Config`."""
+class Spec(NamedTuple):
+    """What one row measures, and the config that says how."""
 
-    scaling: str
-    work: str
-    devices: int
-    side: int
-    nx: int
-    axes: int
-    cutoff_ratio: float
-    dtype: str
-    repeats: int
-    min_seconds: float
-    steps: int
-    check_most: int
-    backend: Name
-
-
-@dataclass(kw_only=True)
-class DeviceRow(TimedRow):
-    """One kind of work on a number of devices; times are of a list, a sum, or a step."""
-
+    config: Config
     scaling: str
     work: str
     axes: int
     devices: int
-    dtype: str
-    particles: int | None = None  # of all devices
-    fluid: int | None = None  # of these, those that are no wall; None but for "sph"
-    fullest: int | None = None  # of the fullest device
-    halo: int | None = None  # particles that are sent to others, of all devices and messages, each time positions are exchanged
-    halo_bytes: int | None = None  # their coordinates [bytes]
-    # What all devices send to others per run or step, padding, values and ids included, as compiled [bytes].
-    sent_bytes: int | None = None
-    halo_s: float | None = None  # to choose the halo, with which a list, and each update of the solver, begins [s]
-    migrate_s: float | None = None  # to balance the load and to move particles, few after the first time; with a halo [s]
-    pairs: int | None = None  # neighbors of all particles together; None for "sph"
-    pairs_of_one: int | None = None  # as one device counts them, up to `check_most` particles
-    # Particles whose number of neighbors is another on one device; of a fluid those that are elsewhere after `steps`, by more than
-    # a hundredth of a spacing, or were at any other place when it began.
-    differing: int | None = None
-    # Rows up to version 4df7264 have it: of each GPU in one run, the time from its first kernel to its last [s], how long
-    # kernels were at work [s], and the longest of them.
-    busy: list[dict[str, Any]] | None = None
+
+
+COLUMNS = (  # of the printed table; what rows hold, `_row` says
+    *("scaling", "work", "axes", "devices", "particles", "fluid", "fullest", "halo", "halo_bytes", "sent_bytes", "ms"),
+    *("efficiency", "halo_ms", "migrate_ms", "status"),
+)
 
 
 def prepare(config: Config) -> None:
@@ -127,21 +91,34 @@ def command(
     return report(run(given, folder, retry_failed), folder)
 
 
-def run(config: Config, folder: Path, retry_failed: bool = False) -> list[DeviceRow]:
+def run(config: Config, folder: Path, retry_failed: bool = False) -> list[table.Line]:
     """Measure all rows that are not there yet; they are added to rows.jsonl one by one."""
-    tasks = [Task((x.key,), f"{x.scaling} {x.work} on {x.devices}", lambda _, x=x: [_row(x)]) for x in config.specs()]
-    about = {"device": jax.devices()[0].device_kind, "versions": _machine.versions()}
-    return fill(RowFile(folder, DeviceRow), tasks, lambda row: row.reason, retry_failed=retry_failed, about=about)
+    parts = [(" ".join(map(str, x[1:])), lambda x=x: [_row(x)]) for x in config.specs()]
+    given = config.model_dump(exclude={"devices", "scaling", "work", "axes", "virtual_devices"})
+    about = {"versions": _machine.versions()}
+    return table.fill_parts(folder, parts, given, about, lambda row: row.get("reason"), retry_failed)
 
 
-def _row(spec: Spec) -> DeviceRow:
-    row = DeviceRow(key=spec.key, scaling=spec.scaling, work=spec.work, axes=spec.axes, devices=spec.devices, dtype=spec.dtype)
+def _row(spec: Spec) -> table.Line:
+    """Return a row.
+
+    - particles, of all devices; fullest, of the fullest device; fluid: those that are no wall, of "sph".
+    - halo: particles that are sent to others, of all devices and messages, each time positions are exchanged; halo_bytes: their
+      coordinates; sent_bytes: what all devices send per run or step, padding, values and ids included, as compiled.
+    - halo_s: to choose the halo, with which a list, and each update of the solver, begins; migrate_s: to balance the load and to
+      move particles, few after the first time; with a halo. Other times are of a list, a sum, or a step.
+    - pairs: neighbors of all particles together; pairs_of_one: as one device counts them, up to `check_most` particles.
+    - differing: particles whose number of neighbors is another on one device; of a fluid those that are elsewhere after `steps`,
+      by more than a hundredth of a spacing, or were at any other place when it began.
+
+    Rows up to version 4df7264 have `busy`: of each GPU in one run, the time from its first kernel to its last [s], how long kernels
+    were at work [s], and the longest of them.
+    """
+    row: table.Line = {name: getattr(spec, name) for name in ("scaling", "work", "axes", "devices")} | {"dtype": spec.config.dtype}
     if spec.devices > jax.device_count():
-        return replace(row, status="skipped", reason=f"there are {jax.device_count()} devices")
-    try:
-        (_sph if spec.work == "sph" else _search)(spec, row)
-    except Exception as error:
-        row.status, row.reason = "failed", f"{type(error).__name__}: {error}"[:500]
+        return row | {"status": "skipped", "reason": f"there are {jax.device_count()} devices"}
+    row["status"] = "ok"
+    table.ask(row, None, lambda: (_sph if spec.work == "sph" else _search)(spec, row))
     return row
 
 
@@ -158,64 +135,63 @@ def mesh_of(devices: int, axes: int) -> Mesh:
 
 def lattice(spec: Spec) -> np.ndarray:
     """Return a jittered lattice with spacing 1, [n, 3]: a cube, or one for each device in a row."""
-    sides = (spec.side * (spec.devices if spec.scaling == "weak" else 1), spec.side, spec.side)
-    x = np.stack(np.meshgrid(*(np.arange(s, dtype=spec.dtype) for s in sides), indexing="ij"), axis=-1).reshape(-1, 3)
-    return x + np.random.default_rng(0).uniform(-0.3, 0.3, x.shape).astype(spec.dtype)
+    side, dtype = spec.config.side, spec.config.dtype
+    sides = (side * (spec.devices if spec.scaling == "weak" else 1), side, side)
+    x = np.stack(np.meshgrid(*(np.arange(s, dtype=dtype) for s in sides), indexing="ij"), axis=-1).reshape(-1, 3)
+    return x + np.random.default_rng(0).uniform(-0.3, 0.3, x.shape).astype(dtype)
 
 
 def _weight(r: Array, i: Any, j: Any) -> Array:  # noqa: ANN401
     return j["m"] * jnp.maximum(1 - (r @ r) / 9, 0) ** 3
 
 
-def _search(spec: Spec, row: DeviceRow) -> None:
-    x, cutoff, backend = lattice(spec), spec.cutoff_ratio, spec.backend
+def _search(spec: Spec, row: table.Line) -> None:
+    x, cutoff, backend = lattice(spec), spec.config.cutoff_ratio, spec.config.backend
     particles = distributed.scatter(x, cutoff, {"m": np.ones(len(x), x.dtype)}, mesh=mesh_of(spec.devices, spec.axes))
     _describe(particles, spec, row)
     counts = distributed.count(particles, cutoff, backend=backend)
-    row.pairs = int(np.asarray(counts).sum(dtype=np.int64))
+    row["pairs"] = int(np.asarray(counts).sum(dtype=np.int64))
     if spec.work == "list":
         capacity = -(-int(jnp.max(counts)) // 8) * 8
         work = jax.jit(lambda p: distributed.search(p, cutoff, capacity=capacity, backend=backend))
     else:
         work = jax.jit(lambda p: distributed.pair_sum(_weight, p, cutoff, p.values, backend=backend))
     _time(work, particles, 1, spec, row)
-    row.status = "ok"
-    if len(x) <= spec.check_most:
+    if len(x) <= spec.config.check_most:
         ids, ours = np.asarray(particles.ids), np.asarray(counts)
         one = np.asarray(jfrnn.count(jnp.asarray(x), cutoff, backend=backend))
-        row.pairs_of_one = int(one.sum(dtype=np.int64))
+        row["pairs_of_one"] = int(one.sum(dtype=np.int64))
         there = ids >= 0
-        row.differing = int((one[ids[there]] != ours[there]).sum()) + abs(len(x) - int(there.sum()))
-        if row.differing:
-            row.status, row.reason = "failed", "neighbors differ from those of one device"
+        row["differing"] = int((one[ids[there]] != ours[there]).sum()) + abs(len(x) - int(there.sum()))
+        if row["differing"]:
+            row |= {"status": "failed", "reason": "neighbors differ from those of one device"}
 
 
-def _sph(spec: Spec, row: DeviceRow) -> None:
+def _sph(spec: Spec, row: table.Line) -> None:
     from jfrnn.cases import fluids
     from jfrnn.sph import spread
     from jfrnn.sph.model import make_model, make_state
 
     depth = 0.5 * (spec.devices if spec.scaling == "weak" else 1)
-    scene = fluids.fluid("dam-break-3d", nx=spec.nx, depth=depth)
-    kind = np.dtype(spec.dtype).type
+    scene = fluids.fluid("dam-break-3d", nx=spec.config.nx, depth=depth)
+    kind = np.dtype(spec.config.dtype).type
 
     def begin(mesh: Mesh) -> spread.Flow:
         along = (1, 0, 2)[: mesh.devices.ndim]  # the tank's depth first: a slab has as much water and wall as any other
-        return spread.begin(spread.spread(make_model(scene, kind, spec.backend), make_state(scene, kind), mesh, along=along))
+        return spread.begin(spread.spread(make_model(scene, kind, spec.config.backend), make_state(scene, kind), mesh, along=along))
 
-    first = begin(mesh_of(spec.devices, spec.axes))
-    flow = spread.run(first, spec.steps)  # room that is missing is made before anything is timed
+    first, steps = begin(mesh_of(spec.devices, spec.axes)), spec.config.steps
+    flow = spread.run(first, steps)  # room that is missing is made before anything is timed
     _describe(flow.particles, spec, row)
-    row.fluid = int(jnp.sum(flow.particles.active & ~flow.particles.values["wall"]))
-    if spec.devices > 1 and flow.particles.total <= spec.check_most:
-        ways = [scene.positions, spread.run(begin(mesh_of(1, 1)), spec.steps).particles]
-        row.differing = sum(map(partial(_elsewhere, 0.01 * scene.spacing), ways, (first.particles, flow.particles)))
-        if row.differing:
-            row.status, row.reason = "failed", "particles are elsewhere than on one device"
+    row["fluid"] = int(jnp.sum(flow.particles.active & ~flow.particles.values["wall"]))
+    if spec.devices > 1 and flow.particles.total <= spec.config.check_most:
+        ways = [scene.positions, spread.run(begin(mesh_of(1, 1)), steps).particles]
+        row["differing"] = sum(map(partial(_elsewhere, 0.01 * scene.spacing), ways, (first.particles, flow.particles)))
+        if row["differing"]:
+            row |= {"status": "failed", "reason": "particles are elsewhere than on one device"}
             return
     del first
-    _time(lambda flow: spread.advance(flow, spec.steps), flow, spec.steps, spec, row, spread.advance)
-    row.status = "ok"
+    _time(lambda flow: spread.advance(flow, steps), flow, steps, spec, row, spread.advance)
 
 
 def _elsewhere(far: float, one: np.ndarray | distributed.Particles, other: distributed.Particles) -> int:
@@ -224,32 +200,32 @@ def _elsewhere(far: float, one: np.ndarray | distributed.Particles, other: distr
     return int((~(np.abs(x - y) <= far)).any(axis=1).sum())
 
 
-def _describe(particles: distributed.Particles, spec: Spec, row: DeviceRow) -> None:
+def _describe(particles: distributed.Particles, spec: Spec, row: table.Line) -> None:
     """Say how many particles there are, on the fullest device, and in halos, and what halos and migration take."""
     halo = distributed.halo(particles)
-    row.particles, row.halo = particles.total, int(halo.sent)
-    row.fullest = int(np.asarray(particles.active).reshape(row.devices, -1).sum(axis=1).max())
-    row.halo_bytes = row.halo * particles.dim * particles.positions.dtype.itemsize
-    row.halo_s = _time_repeats(lambda: distributed.halo(particles), spec)["median_s"]
+    row |= {"particles": particles.total, "halo": int(halo.sent)}
+    row["fullest"] = int(np.asarray(particles.active).reshape(row["devices"], -1).sum(axis=1).max())
+    row["halo_bytes"] = row["halo"] * particles.dim * particles.positions.dtype.itemsize
+    row["halo_s"] = _time_repeats(lambda: distributed.halo(particles), spec)["median_s"]
     settled = distributed.migrate(particles)
-    row.migrate_s = _time_repeats(lambda: distributed.migrate(settled), spec)["median_s"]
+    row["migrate_s"] = _time_repeats(lambda: distributed.migrate(settled), spec)["median_s"]
 
 
 def _time_repeats(call: Callable[[], Any], spec: Spec) -> dict[str, Any]:
-    _, seconds = _measure.repeat(lambda: jax.block_until_ready(call()), spec.repeats, spec.min_seconds, 10 * spec.repeats)
-    return _measure.summarize(seconds)
+    fewest, least = spec.config.repeats, spec.config.min_seconds
+    return _measure.summarize(_measure.repeat(lambda: jax.block_until_ready(call()), fewest, least, 10 * fewest)[1])
 
 
-def _time(work: Callable[[Any], Any], given: Any, per: int, spec: Spec, row: DeviceRow, compiled: Any = None) -> None:  # noqa: ANN401
+def _time(work: Callable[[Any], Any], given: Any, per: int, spec: Spec, row: table.Line, compiled: Any = None) -> None:  # noqa: ANN401
     """Time calls of compiled work, and add up what it sends."""
-    arguments = (given,) if compiled is None else (given, spec.steps)
+    arguments = (given,) if compiled is None else (given, spec.config.steps)
     program: Any = compiled or work
     text = program.lower(*arguments).compile().as_text()
-    row.sent_bytes = sent_bytes(text)
-    (row.first_s,) = _measure.repeat(lambda: jax.block_until_ready(work(given)), 1, 0.0, 1)[1]  # what it made is gone, it is large
+    row["sent_bytes"] = sent_bytes(text)
+    # what the first call makes is gone, it is large
+    (row["first_s"],) = _measure.repeat(lambda: jax.block_until_ready(work(given)), 1, 0.0, 1)[1]
     timed = _time_repeats(lambda: work(given), spec)
-    row.median_s, row.p10_s, row.p90_s = (timed[name] / per for name in ("median_s", "p10_s", "p90_s"))
-    row.repeats = timed["repeats"]
+    row |= {name: timed[name] / per for name in ("median_s", "p10_s", "p90_s")} | {"repeats": timed["repeats"]}
 
 
 def sent_bytes(program: str) -> int:
@@ -266,16 +242,13 @@ def sent_bytes(program: str) -> int:
     return total
 
 
-def report(rows: list[DeviceRow], folder: Path) -> str:
+def report(rows: list[table.Line], folder: Path) -> str:
     """Return the table of a run, and write it beside the rows: efficiency is a device's particles per second over one alone."""
-    table = pd.DataFrame([asdict(row) for row in rows])
-    rates = [None if not row.median_s or not row.particles else row.particles / row.median_s / row.devices for row in rows]
-    alone = {(row.scaling, row.work, row.axes): rate for row, rate in zip(rows, rates, strict=True) if row.devices == 1}
-    ones = [alone.get((row.scaling, row.work, row.axes)) for row in rows]
-    table["efficiency"] = [None if not rate or not one else rate / one for rate, one in zip(rates, ones, strict=True)]
+    frame = pd.DataFrame(rows).reindex(columns=[*dict.fromkeys((*COLUMNS, "median_s", "halo_s", "migrate_s"))])
+    rate = frame["particles"] / frame["median_s"].astype(float) / frame["devices"]
+    kinds = [frame[name] for name in ("scaling", "work", "axes")]
+    frame["efficiency"] = rate / rate.where(frame["devices"] == 1).groupby(kinds).transform("max")
     for name, seconds in (("ms", "median_s"), ("halo_ms", "halo_s"), ("migrate_ms", "migrate_s")):
-        table[name] = 1e3 * table[seconds].astype(float)
-    names = "scaling work axes devices particles fluid fullest halo halo_bytes sent_bytes ms efficiency halo_ms migrate_ms status"
-    columns = names.split()
-    table[columns].to_csv(folder / "table.csv", index=False)
-    return table[columns].to_string(index=False, float_format="%.3g")
+        frame[name] = 1e3 * frame[seconds].astype(float)
+    frame[[*COLUMNS]].to_csv(folder / "table.csv", index=False)
+    return table.text(frame, COLUMNS)

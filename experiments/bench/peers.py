@@ -5,7 +5,7 @@ import multiprocessing
 import resource
 import warnings
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from multiprocessing.connection import Connection
@@ -15,9 +15,9 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 import typer
 
-from experiments import _table
 from experiments._commands import check_names, finite
 from experiments.bench import table
+from experiments.pages import cpu
 from jfrnn.cases.catalog import CATALOG, Problem, problem
 
 Pairs = tuple[np.ndarray, np.ndarray]
@@ -198,7 +198,9 @@ def command(
     """
     check_names("peer", names, PEERS)
     parts = [(name, partial(_rows, name, limit)) for name in names or PEERS]
-    return markdown(table.measure(out, "answers", parts, limit, COLUMNS).astype(object).fillna("").astype(str).to_dict("records"))
+    return cpu.answers(
+        table.measure(out, "answers", parts, limit, COLUMNS).astype(object).fillna("").astype(str).to_dict("records")
+    )
 
 
 def _rows(name: str, limit_s: float) -> Iterator[dict[str, Any]]:
@@ -206,28 +208,6 @@ def _rows(name: str, limit_s: float) -> Iterator[dict[str, Any]]:
     cases = [(row.title, case) for row in CATALOG for case in row.cases]
     for (title, case), answer in zip(cases, _answers(name, [case for _, case in cases], limit_s), strict=True):
         yield {"row": title, "case": case, "peer": name, "version": _version(PEERS[name].package)} | answer
-
-
-def markdown(rows: Sequence[dict[Any, str]]) -> str:
-    """Return answers as a table in Markdown, a line for each row of the catalog and a column for each peer."""
-    versions = {row["peer"]: row["version"] for row in rows}
-    lines = []
-    for row in (row for row in CATALOG if row.cases):
-        answers = {peer: [r for r in rows if r["row"] == row.title and r["peer"] == peer] for peer in versions}
-        lines.append({"case": row.title} | {f"{peer} {versions[peer]}": _summarize(found) for peer, found in answers.items()})
-    return _table.markdown(lines)
-
-
-def _summarize(rows: list[dict[Any, str]]) -> str:
-    """Say in a word or two what a peer answered on all cases of a row."""
-    if all(row["answer"] == "right" for row in rows):
-        return "right"
-    parts = []
-    for row in rows:
-        counts = [f"{row[kind]} {kind}" for kind in ("missing", "extra") if row[kind] not in ("", "0")]
-        said = {"wrong": ", ".join(counts), "error": f"error: {row['reason'].rstrip('.')[:60]}"}
-        parts.append(said.get(row["answer"], row["answer"]))
-    return "; ".join(part for part in dict.fromkeys(parts) if part != "right")
 
 
 def _version(package: str) -> str:

@@ -1,6 +1,6 @@
 """What a step of a simulation costs that keeps its neighbor list, beside one that makes it anew."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -49,6 +49,14 @@ def _rows(backend: Name, spacing: float, steps: int, repeats: int) -> Iterator[t
 
 def _time_scan(x: jax.Array, nbrs: jfrnn.NeighborList, velocity: float, steps: int, repeats: int) -> tuple[float, int]:
     """Return seconds per step, the median, and the number of rebuilds."""
+    run = compile_updates(velocity, steps)
+    jax.block_until_ready(run(x, nbrs))
+    (_, rebuilds), seconds = _measure.repeat(lambda: jax.block_until_ready(run(x, nbrs)), repeats, 0.0, repeats)
+    return _measure.summarize(seconds)["median_s"] / steps, int(rebuilds)
+
+
+def compile_updates(velocity: float, steps: int) -> Callable[[jax.Array, jfrnn.NeighborList], tuple[jax.Array, jax.Array]]:
+    """Return a compiled scan that moves all particles and updates a list: from both to where they are and how often it was made."""
 
     @jax.jit
     def run(x: jax.Array, nbrs: jfrnn.NeighborList) -> tuple[jax.Array, jax.Array]:
@@ -60,6 +68,4 @@ def _time_scan(x: jax.Array, nbrs: jfrnn.NeighborList, velocity: float, steps: i
         x, nbrs = jax.lax.scan(step, (x, nbrs), None, length=steps)[0]
         return x, nbrs.rebuild_count
 
-    jax.block_until_ready(run(x, nbrs))
-    (_, rebuilds), seconds = _measure.repeat(lambda: jax.block_until_ready(run(x, nbrs)), repeats, 0.0, repeats)
-    return _measure.summarize(seconds)["median_s"] / steps, int(rebuilds)
+    return run

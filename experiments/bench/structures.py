@@ -20,21 +20,8 @@ LIBRARIES = ("jfrnn", "ase", "matscipy", "matscipy-neighbours", "vesin")
 CUTOFF = 5.0  # [angstrom]
 DENSITY = 0.06  # [atoms/angstrom³]
 LETTERS = "ijSDd"
-COLUMNS = (
-    "who",
-    "cache",
-    "structures",
-    "total_s",
-    "first_s",
-    "pairs",
-    "atoms",
-    "median_us",
-    "p10_us",
-    "p90_us",
-    "status",
-    "commit",
-    "dirty",
-)
+COLUMNS = ("who", "cache", "structures", "total_s", "first_s", "pairs", "atoms", "median_us", "p10_us", "p90_us", "status")
+COLUMNS += ("commit", "dirty")
 ROOT = Path(__file__).resolve().parents[2]
 Find = Callable[[np.ndarray, np.ndarray], Any]  # positions and cell -> arrays
 

@@ -17,10 +17,7 @@ from experiments.bench.sums import ERROR_UNIT, Config, SumRow, run
 from experiments.bench.ways import WAYS
 
 FUSED = "pair_sum warp"
-PANELS = {
-    "seconds": "list and sums [s]",
-    "B per particle": "peak memory [B per particle]",
-}
+PANELS = {"seconds": "list and sums [s]", "B per particle": "peak memory [B per particle]"}
 SHARED = (1, 2, 5, 10, 20, 50, 100, 200)  # sums per rebuild of a list
 _OTHERS = ("jax-md", "nvalchemi", "scipy")
 _COLORS = dict(zip((way for way in WAYS if way.startswith(_OTHERS)), PEERS_COLORS, strict=False))

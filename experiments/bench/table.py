@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import pandas as pd
 
@@ -17,13 +17,26 @@ Part = tuple[str, Callable[[], Iterable[Line]]]
 Found = TypeVar("Found")
 
 
-class Way(Protocol):
-    """A way to answer a question: its method, if it is one of others, may not be installed."""
+UNTOLD = ("kind", "key", "versions", "machine", "commit", "dirty", "time", "seconds", "wrong_cases")  # in a table of many kinds
+ROUNDED = 1e-3  # share of the particles for which the answer of a peer may be wrong: its distances are rounded
 
-    @property
-    def method(self) -> str | None:
-        """The name of its adapter in `experiments.methods`, or None."""
-        ...
+
+class Way(NamedTuple):
+    """Who does what.
+
+    Attributes:
+        make: Returns what answers, of a scene.
+        wrong: How many particles of a scene such an answer is wrong for.
+        method: Of a peer, the adapter in `experiments.methods` that says whether it is installed.
+        package: Of a peer, the distribution whose version is told.
+    """
+
+    who: str
+    what: str
+    make: Callable[[Any], Any]
+    wrong: Callable[[Any, Any], int]
+    method: str | None = None
+    package: str = "jfrnn"
 
 
 def installed(ways: Iterable[Way]) -> list[str]:
@@ -43,12 +56,68 @@ def ask(row: Line, method: str | None, answer: Callable[[], Found]) -> Found | N
         return None
 
 
-def judge(row: Line, wrong: int, most: float) -> bool:
-    """Say whether an answer is right but for so many particles, and let the row say so."""
+class Ready(NamedTuple):
+    """What a way made of a scene, and a call of it whose answer is right."""
+
+    made: Any
+    call: Callable[[], Any]
+
+
+def judge(row: Line, way: Way, scene: Any, compiled: Callable[[Any], Callable[[], Any]]) -> Ready | None:  # noqa: ANN401
+    """Make a way ready; where it cannot be had or its answer is wrong, return None, and the row says why.
+
+    Args:
+        row: Also says who does what, and for how many particles the answer is wrong.
+        way: What is asked.
+        scene: Particles, at `scene.x`.
+        compiled: Returns a call of what the way makes.
+    """
+
+    def answer() -> tuple[Ready, int]:
+        made = way.make(scene)
+        call = compiled(made)
+        return Ready(made, call), way.wrong(scene, call())
+
+    row |= {"who": way.who, "what": way.what}
+    found = ask(row, way.method, answer)
+    if found is None:
+        return None
+    ready, wrong = found
     row |= {"status": "ok", "wrong": wrong}
-    if wrong > most:
-        row |= {"status": "failed", "reason": f"the answer is wrong for {wrong} particles"}
-    return wrong <= most
+    if way.method is not None:
+        row["peer"] = _machine.versions([way.package])[way.package]
+    if wrong <= (0 if way.method is None else ROUNDED * len(scene.x)):
+        return ready
+    row |= {"status": "failed", "reason": f"the answer is wrong for {wrong} particles"}
+    return None
+
+
+def fill_parts(
+    folder: Path,
+    parts: Iterable[Part],
+    given: object,
+    about: Line,
+    describe: Callable[[Line], str | None] = lambda row: None,
+    retry_failed: bool = False,
+) -> list[Line]:
+    """Measure what the folder does not hold yet, and return the rows of all parts.
+
+    Args:
+        folder: Takes rows.jsonl.
+        parts: What is measured, by name: each makes rows.
+        given: What else decides what is measured: with another value, all is measured.
+        about: What else rows say of where they were measured.
+        describe: Returns a row as a line for the reader, or None.
+        retry_failed: Whether parts whose last row is of something missing or failed are measured again.
+    """
+    import jax
+
+    tasks = []
+    for label, rows in parts:
+        key = digest([label, given])
+        tasks.append(Task((key,), label, lambda _, key=key, rows=rows: in_parts(key, rows())))
+    about |= {"device": jax.devices()[0].device_kind}
+    return fill(RowFile(take_folder(folder), dict), tasks, describe, about=about, retry_failed=retry_failed)
 
 
 def measure(folder: Path, name: str, parts: Iterable[Part], given: object, columns: Sequence[str]) -> pd.DataFrame:
@@ -57,26 +126,30 @@ def measure(folder: Path, name: str, parts: Iterable[Part], given: object, colum
     Args:
         folder: Takes the files.
         name: Of the table, such as cpu_warp.
-        parts: What is measured, by name: each makes rows.
-        given: What else decides what is measured: with another value, all is measured.
+        parts: As of `fill_parts`.
+        given: Likewise.
         columns: Of the table; what a row lacks is left empty.
     """
     import jax
 
-    file = RowFile(take_folder(folder), dict)
-    tasks = []
-    for label, rows in parts:
-        key = digest([name, label, given])
-        tasks.append(Task((key,), label, lambda _, key=key, rows=rows: in_parts(key, rows())))
-    device, versions = jax.devices()[0], _machine.versions()
-    about = {"platform": device.platform, "device": device.device_kind, "versions": versions}
-    rows = fill(file, tasks, lambda row: None, about=about)
+    about = {"platform": jax.devices()[0].platform, "versions": _machine.versions()}
+    rows = fill_parts(folder, parts, [name, given], about)
     frame = pd.DataFrame(
         [row | {"jax": row["versions"]["jax"], "warp": row["versions"]["warp-lang"]} for row in rows], dtype=object
     )
     frame = frame.reindex(columns=[*columns])
     frame.to_csv(folder / f"{name}.csv", index=False)
     return frame
+
+
+def report(rows: list[Line], folder: Path) -> str:
+    """Return a table for each kind of rows, with the columns that one of them has, and write it as KIND.csv into the folder."""
+    parts = []
+    for kind, part in pd.DataFrame(rows, dtype=object).groupby("kind", sort=False):
+        shown = part.drop(columns=[*UNTOLD], errors="ignore").dropna(axis="columns", how="all")
+        shown.to_csv(folder / f"{kind}.csv", index=False)
+        parts.append(f"{kind}\n{text(shown.where(shown.notna(), ''))}")
+    return "\n\n".join(parts)
 
 
 def text(frame: pd.DataFrame, columns: Sequence[str] | None = None) -> str:

@@ -18,8 +18,8 @@ from jax.typing import DTypeLike
 import jfrnn
 from experiments import _config, _layouts, _measure, _oracle
 from experiments._commands import MOST_POINTS, Engine, Rounds
-from experiments._library import Name, round_capacity
-from experiments.bench import table
+from experiments._library import Name
+from experiments.bench import lists, table
 
 JITTER = 0.3  # of a spacing, to either side
 SAMPLE = 2000  # particles whose neighbors are compared with the oracle's
@@ -121,13 +121,7 @@ def _rows(scene: str, sites: Callable[[], np.ndarray], dtype: DTypeLike, rounds:
 
 
 def _compile(sites: _Sites, backend: Name) -> dict[str, Callable[[], Any]]:
-    x, r = jnp.asarray(sites.positions), sites.cutoff
-    count = jax.jit(lambda x: jfrnn.count(x, r, backend=backend))
-    capacity = round_capacity(int(np.asarray(count(x)).max()))
-    search = jax.jit(lambda x: jfrnn.search(x, r, capacity=capacity, backend=backend).idx)
-
-    def kernel(d: jax.Array, i: Any, j: Any) -> jax.Array:  # noqa: ANN401
-        return jnp.maximum(1 - d @ d / (r * r), 0) ** 3
-
-    density = jax.jit(lambda x: jfrnn.pair_sum(kernel, x, r, backend=backend))
-    return {"count": lambda: count(x), "list": lambda: search(x), "density": lambda: density(x)}
+    x, counts = jnp.asarray(sites.positions), jfrnn.count(sites.positions, sites.cutoff, backend=backend)
+    scene = lists.Scene(x, sites.cutoff, np.asarray(counts))
+    made = {"count": lists.count, "list": lists.search, "density": lists.density}
+    return {what: partial(jax.jit(make(scene, backend=backend)), x) for what, make in made.items()}

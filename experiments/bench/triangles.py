@@ -1,7 +1,7 @@
 """Particles around a gear: what `search_triangles` takes, beside libraries that find the nearest triangle of each point."""
 
 import importlib.util
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from time import process_time
@@ -109,16 +109,22 @@ def gear(n: int, faces: int) -> _Scene:
 def _calls(scene: _Scene, cutoff: float, backend: Name) -> tuple[dict[str, Callable[[], Any]], jfrnn.TriangleList]:
     x, vertices = jnp.asarray(scene.points), jnp.asarray(scene.vertices)
     tri = jfrnn.search_triangles(x, vertices, jnp.asarray(scene.faces), cutoff, backend=backend)
-    update = jax.jit(lambda x, tri: tri.update(x))
-    rebuild = jax.jit(lambda x, vertices, tri: tri.update(x, vertices=vertices))
-    single = jax.jit(lambda x, tri: tri.update(x).count)
-    calls: dict[str, Callable[[], Any]] = {"update": lambda: update(x, tri), "rebuild": lambda: rebuild(x, vertices, tri)}
-    calls["count"] = lambda: single(x, tri)
-    for curve in _CURVES:
-        ordered = x[jfrnn.sort_order(x, cutoff, curve=curve)]
-        calls[f"update, {curve} order"] = lambda ordered=ordered: update(ordered, tri)
+    calls = updates(tri, x, vertices, _CURVES)
     jax.block_until_ready([call() for call in calls.values()])
     return calls, tri
+
+
+def updates(tri: jfrnn.TriangleList, x: jax.Array, vertices: jax.Array, curves: Sequence[Name]) -> dict[str, Callable[[], Any]]:
+    """Return compiled updates of a list by name: of a wall that stays or is sorted anew, counts, and particles along curves."""
+    update = jax.jit(lambda x, tri: tri.update(x))
+    rebuild = jax.jit(lambda x, vertices, tri: tri.update(x, vertices=vertices))
+    count = jax.jit(lambda x, tri: tri.update(x).count)
+    calls: dict[str, Callable[[], Any]] = {"update": lambda: update(x, tri), "rebuild": lambda: rebuild(x, vertices, tri)}
+    calls["count"] = lambda: count(x, tri)
+    for curve in curves:
+        ordered = x[jfrnn.sort_order(x, tri.cutoff, curve=curve)]
+        calls[f"update, {curve} order"] = lambda ordered=ordered: update(ordered, tri)
+    return calls
 
 
 def _libigl(scene: _Scene) -> _Asked:

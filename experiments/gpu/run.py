@@ -6,20 +6,14 @@ A time counts only where its pairs were checked: lists are compared as sets with
 import functools
 import itertools
 import os
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 from experiments import _machine
-from experiments._config import digest
 from experiments._library import load_warp
-from experiments._loop import Task, fill, in_parts
-from experiments._rows import RowFile
+from experiments.bench.table import Line, Part, fill_parts
 from experiments.gpu import exactness, timings, triangles
 from experiments.gpu.config import Config
-
-GpuRow = dict[str, Any]
-Part = tuple[str, Callable[[], Iterable[GpuRow]]]
 
 
 def run(config: Config, folder: Path) -> int:
@@ -29,13 +23,8 @@ def run(config: Config, folder: Path) -> int:
     import jax
 
     jax.config.update("jax_enable_x64", True)
-    versions = _machine.versions() | {"warp-lang": load_warp().__version__}
-    tasks = []
-    for name, rows in parts(config):
-        key = digest([name, config.model_dump()])
-        tasks.append(Task((key,), name, lambda _, key=key, rows=rows: in_parts(key, rows())))
-    about = {"device": jax.devices()[0].device_kind, "versions": versions}
-    return sum(int(row.get("wrong", 0) or 0) for row in fill(RowFile(folder, dict), tasks, describe, about=about))
+    about = {"versions": _machine.versions() | {"warp-lang": load_warp().__version__}}
+    return sum(int(row.get("wrong", 0) or 0) for row in fill_parts(folder, parts(config), config.model_dump(), about, describe))
 
 
 def parts(config: Config) -> Iterator[Part]:
@@ -59,7 +48,7 @@ def parts(config: Config) -> Iterator[Part]:
             yield name, functools.partial(triangles.rows, n, part.faces, cutoff, dtype, config.steps, timed)
 
 
-def describe(row: GpuRow) -> str:
+def describe(row: Line) -> str:
     """Return a row as a line for the reader."""
     names = ("kind", "method", "layout", "points", "dtype", "dim", "cases", "wrong", "median_s", "reason")
     return " ".join(f"{name} {row[name]}" for name in names if row.get(name) is not None)

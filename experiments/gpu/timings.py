@@ -1,6 +1,5 @@
 """Timings on a GPU: searches, counts, sums and lists of scenes, what memory they take, and the bandwidth of the card."""
 
-import functools
 import itertools
 import time
 from collections.abc import Callable, Iterator
@@ -13,8 +12,9 @@ from jax import lax
 
 import jfrnn
 from experiments import _compare, _measure
-from experiments._library import Name, load_warp, round_capacity
-from experiments.bench import ways
+from experiments._library import load_warp, round_capacity
+from experiments.bench import lists, ways
+from experiments.bench.skin import compile_updates
 from experiments.gpu.config import Config
 
 # --- scenes -----------------------------------------------------------------------------------------------------------
@@ -53,14 +53,14 @@ def memory_rows() -> Iterator[dict[str, Any]]:
     jax.block_until_ready(jfrnn.search(jnp.asarray(blob[:1000], jnp.float32), 1.0, backend="warp").idx)  # libraries
     for name, points in scenes.items():
         x = jnp.asarray(points, jnp.float32)
-        capacity = round_capacity(int(jfrnn.count(x, 1.0, backend="warp").max()))
-        search = jax.jit(functools.partial(_list, cutoff=1.0, capacity=capacity, backend="warp"))
+        scene = lists.Scene(x, 1.0, np.asarray(jfrnn.count(x, 1.0, backend="warp")))
+        search = jax.jit(lists.search(scene, backend="warp"))
         compiled: Any = search.lower(x).compile().memory_analysis()
         before = _measure.device_bytes("bytes_in_use")
         jax.block_until_ready(search(x))
-        plan = jfrnn.memory_plan(len(points), 1.0, capacity, backend="warp")
+        plan = jfrnn.memory_plan(len(points), 1.0, scene.capacity, backend="warp")
         yield {
-            "kind": "memory", "method": "warp", "layout": name, "points": len(points), "capacity": capacity,
+            "kind": "memory", "method": "warp", "layout": name, "points": len(points), "capacity": scene.capacity,
             "planned_bytes": plan.total_bytes, "planned_scratch_bytes": plan.scratch_bytes,
             "compiled_bytes": compiled.temp_size_in_bytes + compiled.output_size_in_bytes,
             "peak_bytes": (_measure.device_bytes("peak_bytes_in_use") or 0) - (before or 0), "warp_pool_bytes": _warp_pool_bytes(),
@@ -73,11 +73,6 @@ def _warp_pool_bytes() -> int:
 
 
 # --- timings -------------------------------------------------------------------------------------------------------
-
-
-def _list(x: Any, *, cutoff: float, capacity: int, backend: Name) -> Any:  # noqa: ANN401
-    nbrs = jfrnn.search(x, cutoff, capacity=capacity, backend=backend)
-    return nbrs.idx, nbrs.count
 
 
 def time_calls(config: Config, call: Callable[[], Any], calls: int | None = None) -> dict[str, Any]:
@@ -103,56 +98,53 @@ def scene_rows(config: Config, layout: str, size: float) -> Iterator[dict[str, A
     points = jitter_lattice(config, int(size)) if layout == "jitter" else _corners(config, size)
     x, cutoff, n = jnp.asarray(points), config.reach_in_spacings, len(points)
     exact = np.asarray(jfrnn.count(x, cutoff, backend="jax"))
-    capacity = round_capacity(int(exact.max()))
-    base = {"layout": layout, "points": n, "capacity": capacity, "dtype": "float32", "exact_directed_pairs": int(exact.sum())}
-    listed = functools.partial(_list, cutoff=cutoff, capacity=capacity)
-
+    scene = lists.Scene(x, cutoff, exact)
+    base = {"layout": layout, "points": n, "capacity": scene.capacity, "dtype": "float32"}
+    base["exact_directed_pairs"] = int(exact.sum())
     for backend in ("warp", "hashgrid"):
-        search = jax.jit(functools.partial(listed, backend=backend))
+        search = jax.jit(lists.search(scene, backend=backend))
         idx, count = search(x)
         again = search(x)
         row = {"kind": "call", "method": f"jfrnn {backend}", **base, "directed_pairs": int(np.asarray(count).sum(dtype=np.int64))}
-        row["wrong"] = int((np.asarray(count) != exact).sum())
+        row["wrong"] = lists.wrong_counts(scene, count)
         row["same_bits_twice"] = bool((idx == again[0]).all() and (count == again[1]).all())
         if n <= 1_000_000:
-            row["wrong"] += _compare.different_rows(idx, jax.jit(functools.partial(listed, backend="jax"))(x)[0])
+            row["wrong"] += _compare.different_rows(idx, jax.jit(lists.search(scene, backend="jax"))(x)[0])
         del idx, count, again
         yield row | time_calls(config, lambda search=search: search(x))
-    counts = jax.jit(lambda x: jfrnn.count(x, cutoff, backend="warp"))
-    yield {"kind": "call", "method": "jfrnn warp, counts", **base, "directed_pairs": int(counts(x).sum())} | time_calls(
-        config, lambda: counts(x)
-    )
+    counts = jax.jit(lists.count(scene, backend="warp"))
+    row = {"kind": "call", "method": "jfrnn warp, counts", **base, "directed_pairs": int(counts(x).sum())}
+    yield row | time_calls(config, lambda: counts(x))
     if n <= 1_000_000:
 
         def step(x: Any, _: None) -> tuple[Any, Any]:  # noqa: ANN401
-            idx, count = listed(x, backend="warp")
+            idx, count = lists.search(scene, backend="warp")(x)
             return x + 0 * (idx[0, 0] + count[0]).astype(x.dtype), None
 
         steps = jax.jit(lambda x: lax.scan(step, x, None, length=config.steps)[0])
-        seconds = [s / config.steps for s in time_calls(config, lambda: steps(x), calls=3)["seconds"]]
-        yield {"kind": "scan", "method": "jfrnn warp", **base, "steps": config.steps, **_measure.summarize(seconds)}
+        yield {"kind": "scan", "method": "jfrnn warp", **base, "steps": config.steps} | _time_scan(config, lambda: steps(x))
     if layout == "jitter":
-        yield from _loop_rows(config, base, x, cutoff)
+        yield from _loop_rows(config, base, scene)
         yield from sum_rows(config, base, x, cutoff)
-    yield from _peer_rows(config, base, x, cutoff)
+    yield from _peer_rows(config, base, scene)
 
 
-def _loop_rows(config: Config, base: dict[str, Any], x: Any, cutoff: float) -> Iterator[dict[str, Any]]:  # noqa: ANN401
+def _time_scan(config: Config, call: Callable[[], Any]) -> dict[str, Any]:
+    """Time the steps of a scan."""
+    return _measure.summarize([seconds / config.steps for seconds in time_calls(config, call, calls=3)["seconds"]])
+
+
+def _loop_rows(config: Config, base: dict[str, Any], scene: lists.Scene) -> Iterator[dict[str, Any]]:
     """What a time loop adds: a periodic box, whose faces close the lattice, and updates of a list with a skin."""
+    x, cutoff = scene.x, scene.cutoff
     box = jfrnn.Box([float(round(base["points"] ** (1 / 3)))] * 3, origin=-0.5)
-    counts = np.asarray(jfrnn.count(x, cutoff, box=box, backend="warp"))
-    capacity = round_capacity(int(counts.max()))
-
-    def periodic(x: Any) -> Any:  # noqa: ANN401
-        nbrs = jfrnn.search(x, cutoff, box=box, capacity=capacity, backend="warp")
-        return nbrs.idx, nbrs.count
-
-    search = jax.jit(periodic)
-    row = {"kind": "call", "method": "jfrnn warp, periodic box", **base, "capacity": capacity}
-    row |= {"directed_pairs": int(counts.sum(dtype=np.int64)), "exact_directed_pairs": None}
+    boxed = scene._replace(counts=np.asarray(jfrnn.count(x, cutoff, box=box, backend="warp")))
+    search = jax.jit(lists.search(boxed, box=box, backend="warp"))
+    row = {"kind": "call", "method": "jfrnn warp, periodic box", **base, "capacity": boxed.capacity}
+    row |= {"directed_pairs": int(boxed.counts.sum(dtype=np.int64)), "exact_directed_pairs": None}
     if base["points"] <= 300_000:
         exact = np.asarray(jfrnn.count(x, cutoff, box=box, backend="jax"))
-        row |= {"wrong": int((counts != exact).sum()), "exact_directed_pairs": int(exact.sum(dtype=np.int64))}
+        row |= {"wrong": lists.wrong_counts(boxed, exact), "exact_directed_pairs": int(exact.sum(dtype=np.int64))}
     yield row | time_calls(config, lambda: search(x))
     if base["points"] > 1_000_000:
         return
@@ -160,20 +152,9 @@ def _loop_rows(config: Config, base: dict[str, Any], x: Any, cutoff: float) -> I
     wider = round_capacity(int(jfrnn.count(x, cutoff + skin, backend="warp").max()))
     nbrs = jfrnn.search(x, cutoff, skin=skin, capacity=wider, backend="warp")
     for name, velocity in (("keeps", 0.0), ("rebuilds", skin)):
-
-        def step(carry: Any, _: None, velocity: float = velocity) -> tuple[Any, None]:  # noqa: ANN401
-            x, nbrs = carry
-            x = x + x.dtype.type(velocity)
-            return (x, nbrs.update(x)), None
-
-        def many(x: Any, nbrs: Any, step: Any = step) -> Any:  # noqa: ANN401
-            return lax.scan(step, (x, nbrs), None, length=config.steps)[0][1].rebuild_count
-
-        steps = jax.jit(many)
-        rebuilds = int(steps(x, nbrs))
-        seconds = [s / config.steps for s in time_calls(config, lambda steps=steps: steps(x, nbrs), calls=3)["seconds"]]
+        steps = compile_updates(velocity, config.steps)
         row = {"kind": "scan", "method": f"jfrnn warp, skin, {name}", **base, "capacity": wider, "steps": config.steps}
-        yield row | {"rebuilds": rebuilds, **_measure.summarize(seconds)}
+        yield row | {"rebuilds": int(steps(x, nbrs)[1])} | _time_scan(config, lambda steps=steps: steps(x, nbrs))
 
 
 def sum_rows(config: Config, base: dict[str, Any], x: Any, cutoff: float) -> Iterator[dict[str, Any]]:  # noqa: ANN401
@@ -195,54 +176,38 @@ def sum_rows(config: Config, base: dict[str, Any], x: Any, cutoff: float) -> Ite
             yield row | {"status": "failed", "reason": f"{type(error).__name__}: {error}"[:300]}
 
 
-def _peer_rows(config: Config, base: dict[str, Any], x: Any, cutoff: float) -> Iterator[dict[str, Any]]:  # noqa: ANN401
+def _peer_rows(config: Config, base: dict[str, Any], scene: lists.Scene) -> Iterator[dict[str, Any]]:
     for name, make in (("warp HashGrid", _plain_hashgrid), ("nvalchemi 0.5.0 cell_list", _nvalchemi)):
         row: dict[str, Any] = {"kind": "call", "method": name, **base}
         try:
-            call, pairs = make(x, cutoff, base["capacity"])
+            call, pairs = make(scene)
             yield row | {"directed_pairs": pairs} | time_calls(config, call)
         except Exception as error:  # a peer that is missing or out of memory says so in its row
             yield row | {"status": "failed", "reason": f"{type(error).__name__}: {error}"[:300]}
 
 
-class _Waited:
-    """A call whose result `jax.block_until_ready` can wait for: Warp's stream."""
-
-    def __init__(self, call: Callable[[], None]) -> None:
-        self._call = call
-
-    def __call__(self) -> "_Waited":
-        self._call()
-        return self
-
-    def block_until_ready(self) -> "_Waited":
-        load_warp().synchronize()
-        return self
-
-
-def _plain_hashgrid(x: Any, cutoff: float, capacity: int) -> tuple[Callable[[], Any], int]:  # noqa: ANN401
+def _plain_hashgrid(scene: lists.Scene) -> tuple[Callable[[], Any], int]:
     """Return a call of `wp.HashGrid` as Warp's examples use it, without JAX: build, then one thread per particle."""
     from experiments.methods._hashgrid_kernels import list_neighbors_kernel
+    from experiments.methods.hashgrid_plain import Counts
 
-    wp = load_warp()
-    points = wp.array(np.asarray(x), dtype=wp.vec3, device="cuda")
-    n = len(points)
+    wp, n, capacity = load_warp(), len(scene.x), scene.capacity
+    points = wp.array(np.asarray(scene.x), dtype=wp.vec3, device="cuda")
     grid = wp.HashGrid(128, 128, 128, device="cuda")
     idx, count = wp.empty((n, capacity), dtype=wp.int32, device="cuda"), wp.empty(n, dtype=wp.int32, device="cuda")
 
-    def call() -> None:
-        grid.build(points, cutoff)
-        wp.launch(list_neighbors_kernel, dim=n, inputs=[grid.id, points, cutoff, capacity], outputs=[idx, count], device="cuda")
+    def call() -> Counts:
+        grid.build(points, scene.cutoff)
+        given = [grid.id, points, scene.cutoff, capacity]
+        wp.launch(list_neighbors_kernel, dim=n, inputs=given, outputs=[idx, count], device="cuda")
+        return Counts(count)
 
-    call()
-    return _Waited(call), int(count.numpy().sum(dtype=np.int64))
+    return call, int(call().array.numpy().sum(dtype=np.int64))
 
 
-def _nvalchemi(x: Any, cutoff: float, capacity: int) -> tuple[Callable[[], Any], int]:  # noqa: ANN401
-    from experiments.methods.nvalchemi import compile_search
-
-    search = compile_search(x, cutoff, capacity)
-    return (lambda: search(x)), int(search(x)[1].sum())
+def _nvalchemi(scene: lists.Scene) -> tuple[Callable[[], Any], int]:
+    search = lists.nvalchemi(scene)
+    return (lambda: search(scene.x)), int(search(scene.x)[1].sum())
 
 
 def _random_points(config: Config, n: int) -> tuple[Any, float]:

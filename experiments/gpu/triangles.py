@@ -16,7 +16,7 @@ import jfrnn
 from experiments import _compare, _measure
 from experiments._library import Name, triangle_query
 from experiments.bench import bvh
-from experiments.bench.triangles import gear
+from experiments.bench.triangles import gear, updates
 
 
 def decisions(oracle: Any, dtype: str, dim: int, capacity: int, backend: Name) -> Iterator[tuple[str, bool]]:  # noqa: ANN401
@@ -71,11 +71,8 @@ def rows(
         timed: Times a call: `experiments.gpu.timings.time_calls`, of a config.
     """
     scene = gear(n, faces)
-    x, vertices, named = (
-        jnp.asarray(scene.points.astype(dtype)),
-        jnp.asarray(scene.vertices.astype(dtype)),
-        jnp.asarray(scene.faces),
-    )
+    x, vertices = (jnp.asarray(part.astype(dtype)) for part in (scene.points, scene.vertices))
+    named = jnp.asarray(scene.faces)
     exact = jfrnn.search_triangles(x, vertices, named, cutoff, backend="jax")
     base = {"kind": "triangles", "layout": "gear", "points": n, "faces": len(scene.faces), "cutoff": cutoff, "dtype": dtype}
     base |= {"capacity": exact.capacity, "pairs": int(np.asarray(exact.count).sum(dtype=np.int64))}
@@ -121,18 +118,8 @@ def _calls(tri: Any, x: Any, vertices: Any, steps: int) -> dict[str, Callable[[]
         tri = tri.update(x)
         return (x + 0 * (tri.idx[0, 0] + tri.count[0]).astype(x.dtype), tri), None
 
-    update = jax.jit(lambda x, tri: tri.update(x))
-    rebuild = jax.jit(lambda x, vertices, tri: tri.update(x, vertices=vertices))
-    count = jax.jit(lambda x, tri: tri.update(x).count)
     scan = jax.jit(lambda x, tri: lax.scan(step, (x, tri), None, length=steps)[0][1].status)
-    ordered = x[jfrnn.sort_order(x, tri.cutoff, curve="morton")]
-    return {
-        "update": lambda: update(x, tri).idx,
-        "update, morton order": lambda: update(ordered, tri).idx,
-        "rebuild": lambda: rebuild(x, vertices, tri).idx,
-        "count": lambda: count(x, tri),
-        "scan of updates": lambda: scan(x, tri),
-    }
+    return updates(tri, x, vertices, ("morton",)) | {"scan of updates": lambda: scan(x, tri)}
 
 
 def stages(tri: Any, x: Any, repeats: int = 5) -> dict[str, Any]:  # noqa: ANN401

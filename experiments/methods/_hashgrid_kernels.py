@@ -31,10 +31,7 @@ def list_neighbors_kernel(
 
 @wp.kernel
 def count_neighbors_kernel(
-    grid: wp.uint64,
-    positions: wp.array(dtype=wp.vec3),
-    cutoffs: wp.array(dtype=float),
-    count_out: wp.array(dtype=wp.int32),
+    grid: wp.uint64, positions: wp.array(dtype=wp.vec3), cutoffs: wp.array(dtype=float), count_out: wp.array(dtype=wp.int32)
 ) -> None:
     """Count the neighbors of one particle per thread within its own cutoff. Launch: dim = n."""
     i = wp.hash_grid_point_id(grid, wp.tid())

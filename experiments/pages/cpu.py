@@ -156,11 +156,29 @@ def triangles() -> str:
     return markdown((">faces", ">cutoff [modules]", ">pairs", *(f">{title}" for title in ways.values())), lines)
 
 
-def answers() -> str:
-    """Return what libraries answer to the hard cases."""
-    from experiments.bench import peers
+def answers(rows: list[Row] | None = None) -> str:
+    """Return what each library answers on the hard cases: those of the page, or those of other rows of `bench peers`."""
+    from jfrnn.cases.catalog import CATALOG
 
-    return peers.markdown(read("peers/answers.csv"))
+    rows = read("peers/answers.csv") if rows is None else rows
+    versions = {row["peer"]: row["version"] for row in rows}
+    lines = []
+    for case in (row.title for row in CATALOG if row.cases):
+        of_case = [[row for row in rows if (row["row"], row["peer"]) == (case, peer)] for peer in versions]
+        lines.append([case, *map(_summarize, of_case)])
+    return markdown(("case", *(f"{peer} {version}" for peer, version in versions.items())), lines)
+
+
+def _summarize(rows: list[Row]) -> str:
+    """Say in a word or two what a peer answered on all cases of a row."""
+    if all(row["answer"] == "right" for row in rows):
+        return "right"
+    parts = []
+    for row in rows:
+        counts = [f"{row[kind]} {kind}" for kind in ("missing", "extra") if row[kind] not in ("", "0")]
+        said = {"wrong": ", ".join(counts), "error": f"error: {row['reason'].rstrip('.')[:60]}"}
+        parts.append(said.get(row["answer"], row["answer"]))
+    return "; ".join(part for part in dict.fromkeys(parts) if part != "right")
 
 
 def structures() -> str:

@@ -1,6 +1,6 @@
 """Tables of the fluid solver."""
 
-from experiments.pages.rows import markdown, number, one, read, whole
+from experiments.pages.rows import RESULTS, markdown, number, one, read, whole
 
 
 def validation() -> str:
@@ -57,7 +57,8 @@ def ways() -> str:
 def peers() -> str:
     """Return steps per second of released solvers, with what a step computes; nothing where none was measured."""
     lines = []
-    for row in read("sph_peers/table.csv"):
+    folders = [name for name in ("sph_peers", "sph_peers_gpu") if (RESULTS / name).is_dir()]
+    for row in [row for name in folders for row in read(f"{name}/table.csv")]:
         rate = number(1 / float(row["seconds"])) if row["seconds"] else row["reason"]
         who = f"{row['solver']} {row['version']}"
         lines.append(

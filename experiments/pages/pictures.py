@@ -68,8 +68,13 @@ def _brief(method: str) -> str:
 
 
 def _gpu(axes: Axes) -> None:
-    """Draw milliseconds of a list over particles, names at the ends of lines."""
-    rows = [row for row in read("h200/rows.jsonl") if row["kind"] == "call" and row.get("median_s")]
+    """Draw milliseconds of a list over particles, names at the ends of lines, and the floor: its bytes over the bandwidth.
+
+    These are 12 B of a position, and 4 B of a count and of each slot; the bandwidth is what a copy reached in the same run.
+    """
+    rows = read("h200/rows.jsonl")
+    bandwidth = (one(rows, kind="ceiling") or {})["bytes_per_s"]
+    rows = [row for row in rows if row["kind"] == "call" and row.get("median_s")]
     ends, found = [], {}
     for method, title in _GPU.items():
         found[method] = {row["points"]: 1e3 * row["median_s"] for row in rows if row["method"] == method}
@@ -77,6 +82,11 @@ def _gpu(axes: Axes) -> None:
         color, marker = (OURS, "o") if title.startswith("jfrnn") else (PEERS_COLORS[len(ends) - 1], "s" if "Hash" in title else "^")
         axes.plot(x, y, color=color, marker=marker)
         ends.append((title, x[-1], y[-1], color))
+    floor = {
+        row["points"]: 4e3 * row["points"] * (4 + row["capacity"]) / bandwidth for row in rows if row["method"] == "jfrnn warp"
+    }
+    axes.plot(*zip(*sorted(floor.items()), strict=True), "--k")
+    ends.append(("floor: bytes / bandwidth", *max(floor.items()), "k"))
     axes.set(xscale="log", yscale="log", xlabel="particles, 108 neighbors on average, one H200", ylabel="milliseconds of a list")
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_major_formatter(lambda value, _: plain(value))

@@ -10,13 +10,7 @@ from jfrnn.cases.periodic import PERIODIC_CASES
 from jfrnn.cases.radii import RADII_CASES
 from jfrnn.cases.triangles import TRIANGLE_CASES
 
-_CASES = {
-    "hard": HARD_CASES,
-    "periodic": PERIODIC_CASES,
-    "radii": RADII_CASES,
-    "batches": BATCH_CASES,
-    "triangles": TRIANGLE_CASES,
-}
+_CASES = {"hard": HARD_CASES, "periodic": PERIODIC_CASES, "radii": RADII_CASES, "batches": BATCH_CASES, "triangles": TRIANGLE_CASES}
 
 
 def _bytes_per_particle(method: str) -> Callable[[], str]:

@@ -24,29 +24,27 @@ from jax import Array, lax
 from jfrnn._engine.boxes import find_in_boxes
 from jfrnn._engine.candidates import Candidates, Excluded, Points, Span, Torus
 from jfrnn._engine.problem import Features, Options, Room, Rows, Search, largest_radius
-from jfrnn._engine.runs import count_neighbors, fill_neighbors, list_neighbors
+from jfrnn._engine.runs import State, count_neighbors, fill_neighbors, list_neighbors
 from jfrnn._engine.tuning import Tuning, by_platform
 from jfrnn._engine.words import CHUNK, LANES
 from jfrnn._geometry import (
     FINE,
-    Axes,
-    Batch,
     CellAxes,
+    CellLine,
     Cells,
     Cutoff,
     Cutoffs,
     ExcludedCodes,
     Lattice,
-    Levels,
+    Part,
     Status,
     Wrapped,
     cell_edge,
     fractions_of,
-    level_runs,
     line_runs,
     open_axes,
+    parts_of,
     sort_along_line,
-    sort_by_levels,
     sort_queries,
     translation,
     unpack_turns,
@@ -94,17 +92,36 @@ class ArrayEngine:
         return Rows(*call_late(functools.partial(by_platform, on), (search._replace(checks={}),), (idx, count, one, one)))
 
     def _rows(self, options: Options, capacity: int | None, tuning: Tuning, search: Search) -> Rows:
-        candidates = find_candidates(search, self.by_cells and not is_few(search, tuning), tuning)
+        cutoff, keep, (n, m) = search.cutoff, options.filter, search.sizes
+        by_cells = self.by_cells and not is_few(search, tuning)
+        counts = jnp.zeros(m, jnp.int32)
         if capacity is None:
-            return complete_rows(search, None, count_neighbors(candidates, search.cutoff, options.filter, tuning), None)
-        return complete_rows(search, *list_neighbors(candidates, search.cutoff, options.filter, capacity, tuning), capacity)
+
+            def count(candidates: Candidates, old: list[Array] | None) -> list[Array]:
+                return count_neighbors(candidates, cutoff, keep, tuning, old)
+
+            (counts,) = fold_candidates(search, by_cells, tuning, count, [counts])
+            return complete_rows(search, None, counts, None)
+
+        def fill(candidates: Candidates, old: list[Array] | None) -> list[Array]:
+            return list_neighbors(candidates, cutoff, keep, capacity, tuning, old)
+
+        images = 1 if search.torus is None or search.torus[0].images.nearest else search.torus[0].images.total
+        blank = jnp.full((m, capacity), n * images, jnp.int32)
+        idx, counts = fold_candidates(search, by_cells, tuning, fill, [blank, counts])
+        return complete_rows(search, idx, counts, capacity)
 
     def _flat_rows(self, search: Search, options: Options, room: Room) -> Rows:
         def on(tuning: Tuning) -> Callable[[tuple[Search, Array]], Array]:
             def fill(operands: tuple[Search, Array]) -> Array:
-                search, starts = operands
-                candidates = find_candidates(search, self.by_cells and not is_few(search, tuning), tuning)
-                return fill_neighbors(candidates, search.cutoff, options.filter, Room(starts, room.total), tuning)
+                (search, starts), keep = operands, options.filter
+                whole = Room(starts, room.total)
+
+                def step(candidates: Candidates, old: list[Array] | None) -> list[Array]:
+                    return fill_neighbors(candidates, search.cutoff, keep, whole, tuning, old)
+
+                by_cells = self.by_cells and not is_few(search, tuning)
+                return fold_candidates(search, by_cells, tuning, step, [jnp.zeros(room.total, jnp.int32), starts[:-1]])[0]
 
             return fill
 
@@ -145,9 +162,36 @@ def complete_rows(search: Search, idx: Array | None, count: Array, capacity: int
     return Rows(idx, count, required, status.astype(jnp.int32))
 
 
-def find_candidates(search: Search, by_cells: bool, tuning: Tuning) -> Candidates:
-    """Return the candidates of each query: all sources (brute force), by cells, or by cells of many sizes."""
-    found = find_in_boxes(search, by_cells) if search.per_system else _find_candidates(search, by_cells, tuning)
+def fold_candidates(
+    search: Search,
+    by_cells: bool,
+    tuning: Tuning,
+    step: Callable[[Candidates, State | None], State],
+    start: State,
+) -> State:
+    """Return step(candidates, None), or, where cutoffs differ, the state after state = step(candidates, state) for each octave.
+
+    Candidates are all sources (brute force), or those of cells. `start` is what the state of several steps begins with.
+    """
+    if search.per_system:
+        return step(_complete(search, find_in_boxes(search, by_cells)), None)
+    if not by_cells:
+        return step(_complete(search, _all_sources(search)), None)
+    if isinstance(search.cutoff, Cutoff):
+        return step(_complete(search, _cell_stencil(search, tuning)), None)
+    there = (search.sources, search.sources if search.queries is None else search.queries)
+    parts = parts_of(search.cutoffs.of_cells, *(jnp.isfinite(x).all(axis=1) for x in there))
+
+    def take(now: tuple[Array, State]) -> tuple[Array, State]:
+        number, state = now
+        candidates = _cell_stencil(search, tuning, parts.part(number, search.sources.dtype))
+        return parts.after(number), step(_complete(search, candidates), state)
+
+    return lax.while_loop(lambda now: now[0] < parts.end, take, (parts.after(-1), start))[1]
+
+
+def _complete(search: Search, found: Candidates) -> Candidates:
+    """Add to candidates what is excluded, and the points as they were given."""
     if search.exclude is not None:
         found = found._replace(excluded=_place_excluded(found, search.exclude))
     return found._replace(given=(search.sources, search.sources if search.queries is None else search.queries))
@@ -166,44 +210,29 @@ def _place_excluded(candidates: Candidates, exclude: ExcludedCodes) -> Excluded:
     return Excluded(exclude.starts, jnp.where(exclude.codes < 0, -(1 << 30), found))
 
 
-def _find_candidates(search: Search, by_cells: bool, tuning: Tuning) -> Candidates:
-    sources, queries, cutoff, batch, given = search[:5]
-    torus = None if given is None else _torus(*given, sources.dtype)
-    clouds = (sources, queries) if given is None else (given[1].sources, None if queries is None else given[1].queries)
-    if not by_cells:
-        return _all_sources(*clouds, cutoff, batch, torus)
-    if isinstance(cutoff, Cutoff):
-        along, axes = _cells_along(sources, queries, cutoff, given)
-        return _cell_stencil(*clouds, along, axes.cells, batch, torus, tuning)
-    images, levels = None if torus is None else torus.images, levels_of(search)
-    of_sources, of_queries = cutoff.of_points
-    points = _in_order(clouds[0], jnp.pad(levels.order, (0, LANES)), of_sources)
-    rows = _in_order(clouds[0] if clouds[1] is None else clouds[1], levels.query_order, of_queries)
-    words, runs = {2: 16, 3: 64}[sources.shape[1]], level_runs(levels, cutoff.of_cells, images)
-
-    def runs_of(span: Span, which: Array) -> tuple[Array, Array, Array | None]:
-        return runs(span.places, which)
-
-    return Candidates(points, rows, runs_of, torus, len(sources), lambda _: words, levels.passes)
+def _clouds(search: Search) -> tuple[Array, Array | None, Torus | None]:
+    """Return sources and queries, near the cell if there is a lattice, and what a lattice adds."""
+    if search.torus is None:
+        return search.sources, search.queries, None
+    wrapped = search.torus[1]
+    return wrapped.sources, None if search.queries is None else wrapped.queries, _torus(*search.torus, search.sources.dtype)
 
 
-def levels_of(search: Search) -> Levels:
-    """Sort a search with cutoffs per particle into cells of many sizes."""
-    cutoff = search.cutoffs
-    along, axes = _cells_along(search.sources, search.queries, cutoff, search.torus)
-    systems = None if search.batch is None else search.batch.of_all
-    return sort_by_levels(along, axes, cutoff, search.sources.shape[0], search.queries is None, systems)
+def _cells_along(search: Search, scale: Array | None) -> tuple[Array, CellAxes]:
+    """Return coordinates [d, n + m] along the axes that cells divide, sources first, and how the axes are divided.
 
-
-def _cells_along(
-    sources: Array, queries: Array | None, cutoff: Cutoff | Cutoffs, torus: tuple[Lattice, Wrapped] | None
-) -> tuple[Array, Axes]:
-    """Return coordinates [d, n + m] along the axes that cells divide, sources first, and how the axes are divided."""
-    if torus is not None:
-        return _cells_of_lattice(sources, queries, largest_radius(cutoff), *torus)
+    Cells are as wide as the cutoff, or as the largest cutoff times `scale`.
+    """
+    sources, queries, radius = search.sources, search.queries, largest_radius(search.cutoff)
+    radius = radius if scale is None else radius * scale
+    if search.torus is not None:
+        lattice, wrapped = search.torus
+        if scale is not None:
+            reach = (wrapped.reach - wrapped.margin) * scale * (1 + 8 * jnp.finfo(sources.dtype).eps) + wrapped.margin
+            wrapped = wrapped._replace(reach=reach)
+        return _cells_of_lattice(sources, queries, radius, lattice, wrapped)
     points = sources if queries is None else jnp.concatenate([sources, queries])
-    one = jnp.ones(points.shape[1], points.dtype)
-    return points.T, Axes(open_axes(cell_edge(largest_radius(cutoff)), points.shape[1]), one, 0 * one)
+    return points.T, open_axes(cell_edge(radius), points.shape[1])
 
 
 def _torus(lattice: Lattice, wrapped: Wrapped, dtype: np.dtype) -> Torus:
@@ -212,10 +241,9 @@ def _torus(lattice: Lattice, wrapped: Wrapped, dtype: np.dtype) -> Torus:
     return Torus(lattice.images, translation(shifts, lattice), lattice.given, (turns[0], turns[1]), wrapped.slack)
 
 
-def _all_sources(
-    sources: Array, queries: Array | None, cutoff: Cutoff | Cutoffs, batch: Batch | None, torus: Torus | None
-) -> Candidates:
+def _all_sources(search: Search) -> Candidates:
     """Return as candidates of a query all sources, or those of its system, once per image: brute force, O(n·m)."""
+    (sources, queries, torus), cutoff, batch = _clouds(search), search.cutoff, search.batch
     images = 1 if torus is None else torus.images.total
     order = query_order = None
     first = end = jnp.zeros((), jnp.int32)
@@ -250,20 +278,19 @@ def _all_sources(
     return Candidates(points, rows, runs, torus, n, of_capacity, in_order=unordered, most_words=words, whole=whole)
 
 
-def _cell_stencil(
-    sources: Array,
-    queries: Array | None,
-    along: Array,
-    axes: CellAxes,
-    batch: Batch | None,
-    torus: Torus | None,
-    tuning: Tuning,
-) -> Candidates:
+def _cell_stencil(search: Search, tuning: Tuning, part: Part | None = None) -> Candidates:
     """Sort sources and queries by cell; the runs of a query are the rows of cells around its own.
 
-    `along` [d, n + m] are the coordinates of the sources, then of the queries, which `axes` divides into cells.
+    With a part, cells are as wide as its cutoffs ask for, and hold its sources and queries alone.
     """
-    n, systems = len(sources), None if batch is None else batch.of_all
+    (sources, queries, torus), batch, n = _clouds(search), search.batch, search.sizes[0]
+    along, axes = _cells_along(search, None if part is None else part.scale)
+    systems, own = None if batch is None else batch.of_all, queries is None
+    if part is not None:
+        if own:
+            queries, along = sources, jnp.concatenate([along, along], axis=1)
+            systems = None if systems is None else jnp.concatenate([systems, systems])
+        along = jnp.where(jnp.concatenate([part.sources, part.queries]), along, jnp.nan)
     line, cells = sort_along_line(along, axes, n, systems, tuning.sorting)
     numbers, order = (line.numbers, line.order) if queries is None else sort_queries(cells, n, tuning.sorting)
     images = None if torus is None else torus.images
@@ -278,7 +305,22 @@ def _cell_stencil(
     rows = points._replace(ids=order) if queries is None else _in_order(queries, order)
     if batch is not None:
         rows = rows._replace(systems=batch.of_queries[order])
-    return Candidates(points, rows, runs, torus, n, functools.partial(_stencil_words, sources.shape[1]), again=line.inside)
+    words = functools.partial(_stencil_words, sources.shape[1])
+    found = Candidates(points, rows, runs, torus, n, words, again=line.inside)
+    return found if part is None else _of_part(found, search.cutoffs, part, line, own)
+
+
+def _of_part(found: Candidates, cutoffs: Cutoffs, part: Part, line: CellLine, own: bool) -> Candidates:
+    """Add to the candidates of a part the cutoffs, and where queries that are sources stand."""
+    of_sources, of_queries = cutoffs.of_points
+    points, rows, place = found.sources, found.queries, lax.iota(jnp.int32, found.size)
+    points = points._replace(radii=None if of_sources is None else of_sources[points.ids])
+    rows = rows._replace(radii=None if of_queries is None else of_queries[rows.ids])
+    if own:
+        nowhere = np.int32(-(1 << 30))
+        places = jnp.zeros_like(place).at[line.order].set(jnp.where(place < line.inside, place, nowhere), unique_indices=True)
+        rows = rows._replace(places=places[rows.ids])
+    return found._replace(sources=points, queries=rows, active=jnp.sum(part.queries, dtype=jnp.int32))
 
 
 def _stencil_words(dim: int, slots: int | None) -> int:
@@ -295,24 +337,21 @@ def _stencil_words(dim: int, slots: int | None) -> int:
 
 def _cells_of_lattice(
     sources: Array, queries: Array | None, radius: np.floating | Array, lattice: Lattice, wrapped: Wrapped
-) -> tuple[Array, Axes]:
+) -> tuple[Array, CellAxes]:
     """Divide a lattice cell along its vectors; open axes of an orthogonal box are divided as without a box."""
     points, packed = sources, wrapped.turns
     if queries is not None:
         points = jnp.concatenate([sources, queries])
         packed = jnp.concatenate([packed, wrapped.query_turns])
     units, turns = fractions_of(points, lattice), unpack_turns(packed, lattice.dim).astype(points.dtype)
-    along, edges, cells, scales, margins = [], [], [], [], []
+    along, edges, cells = [], [], []
     for k, periodic in enumerate(lattice.images.periodic):
         straight = lattice.images.orthogonal and not periodic
         x = points[:, k] if straight else jnp.clip(units[:, k] - turns[:, k], 0, 1) if periodic else units[:, k]
         along.append(jnp.where(packed >= 0, x, jnp.nan))
         edges.append(cell_edge(radius if straight else wrapped.reach[k]))
         cells.append(jnp.clip(jnp.floor(1 / wrapped.reach[k]), 1, 2.0**23) if periodic else None)
-        scales.append(jnp.ones_like(wrapped.reach[k]) if straight else (wrapped.reach[k] - wrapped.margin[k]) / radius)
-        margins.append(0 * wrapped.margin[k] if straight else wrapped.margin[k])
-    scale = jnp.stack(scales) * (1 + 8 * jnp.finfo(points.dtype).eps)
-    return jnp.stack(along), Axes(CellAxes(edges, cells), scale, jnp.stack(margins))
+    return jnp.stack(along), CellAxes(edges, cells)
 
 
 def _in_order(positions: Array, order: Array | None, radii: Array | None = None) -> Points:

@@ -24,12 +24,13 @@ ENGINES: dict[str, Engine] = {
 
 
 # The number of sources from which on "auto" is Warp, by platform; for fewer, and on other platforms, it is "jax".
-# `python -m experiments bench crossover`, rows in experiments/results/crossovers: compiled searches of 16 to 100 000 random points
-# in 3D with 30 and 108 neighbors. On the CPU no engine is faster than Warp at any size: brute force is level with it up to 32
-# points, 1.2x slower at 64; jax is 1.2x slower at 16, 3x at 256, 15x at 100 000. Warp compiles sooner too: in 0.05 s instead of
-# 1 to 3 s. On an H200 (16, 32 and 64 points measured) jax takes 1.8 to 2.1 times as long as Warp, brute force 1.2 to 1.4 times;
-# and Warp lists 250 000 points (experiments/results/h200) in less time than jax 64. On the CPU, Warp is per particle 14 to 20 times
-# as fast with a box or a batch, 4 to 26 times with a cutoff per particle (experiments/results/options: cpu_warp.csv, cpu_jax.csv).
+# Rows in experiments/results/crossovers (`bench crossover`, which version 8ac2398 was the last to have): compiled searches of 16
+# to 100 000 random points in 3D with 30 and 108 neighbors. On the CPU no engine is faster than Warp at any size: brute force is
+# level with it up to 32 points, 1.2x slower at 64; jax is 1.2x slower at 16, 3x at 256, 15x at 100 000. Warp compiles sooner too:
+# in 0.05 s instead of 1 to 3 s. On an H200 (16, 32 and 64 points measured) jax takes 1.8 to 2.1 times as long as Warp, brute force
+# 1.2 to 1.4 times; and Warp lists 250 000 points (experiments/results/h200) in less time than jax 64. On the CPU, Warp is per
+# particle 14 to 20 times as fast with a box or a batch, 4 to 26 times with a cutoff per particle (experiments/results/options:
+# cpu_warp.csv, cpu_jax.csv).
 _WARP_FROM = {"cpu": 0, "gpu": 0}
 
 

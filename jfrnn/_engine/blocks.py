@@ -157,14 +157,26 @@ class BlockSearch(NamedTuple):
             return Span(0, self.block_size)
         return Span(jnp.minimum(b * self.block_size, self.queries.ids.size - self.block_size), self.block_size)
 
-    def map_blocks(self, of_block: Callable[[Span], list[Array]], columns: list[tuple[int, ...]]) -> list[Array]:
-        """Return of_block(span), int32 arrays with a row per query, for all queries in the order of their indices.
+    @property
+    def used_blocks(self) -> Array | int:
+        """Number of blocks whose queries have candidates."""
+        active = self.candidates.active
+        return self.block_count if active is None else -(-active // self.block_size)
 
-        `columns` are the shapes of a row of each array.
+    def fresh(self, b: Array | int, span: Span) -> Array:
+        """Say which queries of block b no earlier block has, [b] bool."""
+        return span.places >= b * self.block_size
+
+    def map_blocks(
+        self, of_block: Callable[[Span, list[Array]], list[Array]], start: list[Array], old: list[Array] | None
+    ) -> list[Array]:
+        """Return of_block(span, rows), int32 arrays with a row per query, for all queries in the order of their indices.
+
+        `rows` are what these rows are before: those of `old`, or all of them the row `start` of each array.
         """
-        ids = self.queries.ids
+        ids, blank = self.queries.ids, [jnp.broadcast_to(x, (self.block_size, *x.shape)) for x in start]
         if self.block_count == 1:
-            rows = of_block(self.block(0))
+            rows = of_block(self.block(0), blank if old is None else [x.at[ids].get(mode="promise_in_bounds") for x in old])
             if self.candidates.in_order:
                 return rows
             place = jnp.zeros_like(ids).at[ids].set(lax.iota(jnp.int32, ids.size), unique_indices=True)
@@ -173,9 +185,18 @@ class BlockSearch(NamedTuple):
         def put(b: Array, out: list[Array]) -> list[Array]:
             span = self.block(b)
             here = span.of(ids)
-            return [x.at[here].set(rows, unique_indices=True) for x, rows in zip(out, of_block(span), strict=True)]
+            return [x.at[here].set(rows, unique_indices=True) for x, rows in zip(out, of_block(span, blank), strict=True)]
 
-        return lax.fori_loop(0, self.block_count, put, [jnp.zeros((ids.size, *shape), jnp.int32) for shape in columns])
+        def put_more(b: Array, out: list[Array]) -> list[Array]:
+            span = self.block(b)
+            here = span.of(ids)
+            found = of_block(span, [x.at[here].get(mode="promise_in_bounds") for x in out])
+            here = jnp.where(self.fresh(b, span), here, ids.size)
+            return [x.at[here].set(rows, mode="drop") for x, rows in zip(out, found, strict=True)]
+
+        if old is not None:
+            return lax.fori_loop(0, self.used_blocks, put_more, old)
+        return lax.fori_loop(0, self.block_count, put, [jnp.zeros((ids.size, *x.shape), jnp.int32) for x in start])
 
     def fold_words(self, span: Span, add: "Add[State]", state: State, few: tuple["Add[State]", int] | None = None) -> State:
         """Return the state after state = add(words, state) for each chunk of candidates of the queries at these positions.
@@ -421,7 +442,7 @@ class BlockSearch(NamedTuple):
         allowed = lanes.places < lanes.of_words(stop)
         if not self.keep.drop_self or self.keep.later_only:
             return allowed
-        own, again, torus = lanes.of_queries(span.places), self.candidates.again, self.candidates.torus
+        own, again, torus = lanes.of_queries(self._own_places(span)), self.candidates.again, self.candidates.torus
         other = lanes.places != own if again is None else (lanes.places != own) & (lanes.places != own + again)
         if lanes.image is not None and torus is not None:
             other = other | lanes.of_words(lanes.image != torus.images.home)
@@ -432,7 +453,7 @@ class BlockSearch(NamedTuple):
         torus, allowed = self.candidates.torus, _lanes_before(stop - lanes.first)
         if not self.keep.drop_self or self.keep.later_only:
             return allowed
-        own = self._lanes_at(span.places, lanes.first)
+        own = self._lanes_at(self._own_places(span), lanes.first)
         if lanes.image is not None and torus is not None:
             own = jnp.where(lanes.image == torus.images.home, own, np.uint32(0))
         return allowed & ~own
@@ -440,10 +461,17 @@ class BlockSearch(NamedTuple):
     def _own_lanes(self, first: Array, image: Array | None, span: Span) -> Array:
         """Return which of a word's 16 candidates is the query itself, if that is finite: bits, [b, words] uint32."""
         finite = functools.reduce(jnp.logical_and, (jnp.isfinite(span.of(x)) for x in self.queries.axes))
-        itself, torus = jnp.where(finite[:, None], self._lanes_at(span.places, first), np.uint32(0)), self.candidates.torus
+        itself, torus = (
+            jnp.where(finite[:, None], self._lanes_at(self._own_places(span), first), np.uint32(0)),
+            self.candidates.torus,
+        )
         if image is None or torus is None:
             return itself
         return jnp.where(image == torus.images.home, itself, np.uint32(0))
+
+    def _own_places(self, span: Span) -> Array:
+        """Return where queries stand among the sources [b], negative if nowhere."""
+        return span.places if self.queries.places is None else span.of(self.queries.places)
 
     def _lanes_at(self, place: Array, first: Array) -> Array:
         """Return the candidates at a position [b] of each query: bits, [b, words] uint32."""

@@ -42,12 +42,14 @@ class Points(NamedTuple):
         ids: [n] int32, their indices.
         radii: [n] cutoffs per particle, or species with a table of cutoffs; None with one cutoff or if the rule does not use them.
         systems: [n] systems of a batch, or None if runs meet no other system than that of their query.
+        places: Of queries that are sources: [m] int32, where each stands among these, negative if nowhere; None: as it is visited.
     """
 
     axes: list[Array]
     ids: Array
     radii: Array | None = None
     systems: Array | None = None
+    places: Array | None = None
 
 
 class Torus(NamedTuple):
@@ -99,6 +101,7 @@ class Candidates(NamedTuple):
         again: [] int32, after how many positions the sources start again; None if each has one position.
         excluded: The sources that queries exclude, or None.
         in_order: Whether queries are visited by their indices. Static.
+        active: [] int32, how many queries have candidates, the first ones in the order of visits; None: all may.
     """
 
     sources: Points
@@ -111,6 +114,7 @@ class Candidates(NamedTuple):
     again: Array | None = None
     excluded: Excluded | None = None
     in_order: bool = False
+    active: Array | None = None
     most_words: int | None = None
     whole: bool = False
     given: tuple[Array, ...] = ()

@@ -5,7 +5,7 @@ import numpy as np
 from jax import Array, lax
 
 from jfrnn._engine.problem import Search, largest_radius
-from jfrnn._geometry import CLASSES, Cutoffs, Lattice, groups_of, order_for_tree
+from jfrnn._geometry import CLASSES, Cutoffs, Lattice, octaves_of, order_for_tree
 from jfrnn.kernels._native import ORDERS, TABLE
 
 MOST_IN_BOX = 1 << 27  # most positions in a box, where ids share their bits with image codes
@@ -79,7 +79,7 @@ def orders_for_tree(search: Search) -> dict[str, Array]:
         if species is not None:
             classes = jnp.minimum(species.astype(jnp.uint32), CLASSES - 1)
         else:
-            classes = None if radii is None else groups_of(radii, cutoffs.largest, CLASSES)
+            classes = None if radii is None else octaves_of(radii, cutoffs.largest, CLASSES).astype(jnp.uint32)
         return order_for_tree(points, classes, systems)
 
     _, *species = (None, None, None) if cutoffs.kinds is None else cutoffs.kinds

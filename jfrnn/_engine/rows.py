@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from jfrnn._engine.arrays import complete_rows, find_candidates, is_few, refuse_many
+from jfrnn._engine.arrays import complete_rows, fold_candidates, is_few, refuse_many
+from jfrnn._engine.candidates import Candidates
 from jfrnn._engine.problem import Inputs, Options, Room, Rows, Search, bits_of, prepare_search, rows_asked, take_present
 from jfrnn._engine.runs import State, Visit, fold_neighbors
 from jfrnn._engine.tuning import Tuning, by_platform
@@ -114,8 +115,12 @@ def fold_pairs(inputs: Inputs, options: Options, elements: int, visit: Visit[Sta
     def on(tuning: Tuning) -> Callable[[tuple[Search, State]], State]:
         def fold(operands: tuple[Search, State]) -> State:
             search, out = operands
-            candidates = find_candidates(search, options.engine.by_cells and not is_few(search, tuning), tuning)
-            return fold_neighbors(candidates, search.cutoff, options.filter, elements, tuning, visit, out)
+
+            def step(candidates: Candidates, old: State | None) -> State:
+                begin = out if old is None else old
+                return fold_neighbors(candidates, search.cutoff, options.filter, elements, tuning, visit, begin)
+
+            return fold_candidates(search, options.engine.by_cells and not is_few(search, tuning), tuning, step, out)
 
         return fold
 

@@ -21,32 +21,35 @@ FOLD_GROUP = 32  # neighbors per query that are folded at a time
 Carry = Any  # the state of a loop over pairs
 
 
-def count_neighbors(candidates: Candidates, cutoff: Cutoff | Cutoffs, keep: Filter, tuning: Tuning) -> Array:
-    """Count the neighbors of every query: [m] int32, in the order of the queries' ids."""
+def count_neighbors(
+    candidates: Candidates, cutoff: Cutoff | Cutoffs, keep: Filter, tuning: Tuning, old: list[Array] | None
+) -> list[Array]:
+    """Count the neighbors of every query: [m] int32, in the order of the queries' ids; added to `old` ones."""
     engine = BlockSearch(candidates, cutoff, keep, tuning, slots=1, capacity=None)
 
-    def count_block(span: Span) -> list[Array]:
+    def count_block(span: Span, rows: list[Array]) -> list[Array]:
         def add(words: HitWords, count: Array) -> Array:
             return count + bit_counts(words.hits).sum(1, dtype=jnp.int32)
 
-        return [engine.fold_words(span, add, jnp.zeros(span.size, jnp.int32))]
+        return [engine.fold_words(span, add, rows[0])]
 
-    return engine.map_blocks(count_block, [()])[0]
+    return engine.map_blocks(count_block, [jnp.int32(0)], old)
 
 
 def list_neighbors(
-    candidates: Candidates, cutoff: Cutoff | Cutoffs, keep: Filter, capacity: int, tuning: Tuning
-) -> tuple[Array, Array]:
+    candidates: Candidates, cutoff: Cutoff | Cutoffs, keep: Filter, capacity: int, tuning: Tuning, old: list[Array] | None
+) -> list[Array]:
     """List the neighbors of every query: [m, capacity] int32 source indices, unused slots n, and [m] int32 true counts.
 
-    If images must be told apart, n times the image code is added to the source index; unused slots are n·images.
+    If images must be told apart, n times the image code is added to the source index; unused slots are n·images. They are added
+    behind those of `old` rows and counts.
     """
     engine = BlockSearch(candidates, cutoff, keep, tuning, slots=capacity, capacity=capacity)
     n, images = candidates.size, engine.images
     group = min(tuning.group, capacity)
     slots = lax.iota(jnp.int32, group)
 
-    def list_block(span: Span) -> list[Array]:
+    def list_block(span: Span, old: list[Array]) -> list[Array]:
         def add(words: HitWords, found: tuple[Array, Array]) -> tuple[Array, Array]:
             (rows, count), (hits, _, image) = found, words
             bits = BitRows.of(hits, tuning.by_gathers)
@@ -88,28 +91,32 @@ def list_neighbors(
                 rows = put_group(*lax.fori_loop(begin, until, next_group, none))
             return rows, count + total
 
-        rows = jnp.full((span.size, capacity), n * images, jnp.int32)
-        return [*engine.fold_words(span, add, (rows, jnp.zeros(span.size, jnp.int32)))]
+        return [*engine.fold_words(span, add, (old[0], old[1]))]
 
-    rows, count = engine.map_blocks(list_block, [(capacity,), ()])
-    return rows, count
+    return engine.map_blocks(list_block, [jnp.full(capacity, n * images, jnp.int32), jnp.int32(0)], old)
 
 
-def fill_neighbors(candidates: Candidates, cutoff: Cutoff | Cutoffs, keep: Filter, room: Room, tuning: Tuning) -> Array:
-    """List the neighbors of every query in rows without gaps: [total] int32, as `list_neighbors` has them, 0 behind the last."""
+def fill_neighbors(
+    candidates: Candidates, cutoff: Cutoff | Cutoffs, keep: Filter, room: Room, tuning: Tuning, old: list[Array] | None
+) -> list[Array]:
+    """List the neighbors of every query in rows without gaps: [total] int32, as `list_neighbors` has them, 0 behind the last.
+
+    Returns also where the next one of each query would stand, [m] int32; `old` are both before.
+    """
     engine = BlockSearch(candidates, cutoff, keep, tuning, slots=FOLD_GROUP, capacity=None)
     n, images = candidates.size, engine.images
     slots = lax.iota(jnp.int32, FOLD_GROUP)
+    old = [jnp.zeros(room.total, jnp.int32), room.starts[:-1]] if old is None else old
 
-    def fill_block(b: Array, out: Array) -> Array:
-        span = engine.block(b)
-        ids = span.of(engine.queries.ids)
-        begin, end = room.starts[ids], room.starts[ids + 1]
+    def fill_block(b: Array, state: list[Array]) -> list[Array]:
+        span, (out, places) = engine.block(b), state
+        ids, fresh = span.of(engine.queries.ids), engine.fresh(b, span)
+        begin, end = places[ids], room.starts[ids + 1]
 
         def add(words: HitWords, found: tuple[Array, Array]) -> tuple[Array, Array]:
             (out, at), (hits, _, image) = found, words
             bits = BitRows.of(hits, tuning.by_gathers)
-            total = bits.total
+            total = jnp.where(fresh, bits.total, 0)
 
             def add_group(state: tuple[Array, Array]) -> tuple[Array, Array]:
                 done, out = state
@@ -125,9 +132,10 @@ def fill_neighbors(candidates: Candidates, cutoff: Cutoff | Cutoffs, keep: Filte
             most = largest_of(total)
             return lax.while_loop(lambda state: state[0] < most, add_group, (jnp.int32(0), out))[1], at + total
 
-        return engine.fold_words(span, add, (out, begin))[0]
+        out, at = engine.fold_words(span, add, (out, begin))
+        return [out, places.at[jnp.where(fresh, ids, places.size)].set(at, mode="drop")]
 
-    return lax.fori_loop(0, engine.block_count, fill_block, jnp.zeros(room.total, jnp.int32))
+    return lax.fori_loop(0, engine.used_blocks, fill_block, old)
 
 
 class Slots(NamedTuple):
@@ -149,7 +157,7 @@ class Block(NamedTuple):
 
     Attributes:
         query: [b] int32, their indices.
-        fresh: [b] bool, False for queries that an earlier block has processed; these have no pairs here.
+        fresh: [b] bool, False for queries that the block before this one has processed; these have no pairs here.
         fold: (add, state) -> state; calls add(slots, state) -> state until all neighbors of all queries were visited.
     """
 
@@ -166,6 +174,8 @@ def fold_neighbors(
 ) -> State:
     """Visit the neighbors of all queries without listing them: out = visit(block, out) for one block after the other.
 
+    Where cutoffs differ, some queries are visited more than once, each time with other neighbors.
+
     `elements` is the number of scalars per pair that a visitor needs; they count as slots of a block.
     """
     size = tuning.fold_group if is_at_once(candidates, tuning) else FOLD_GROUP
@@ -175,7 +185,7 @@ def fold_neighbors(
     def fold_block(b: Array, out: State) -> State:
         span = engine.block(b)
         ids = span.of(engine.queries.ids)
-        fresh = span.places >= b * engine.block_size
+        fresh = engine.fresh(b, span)
 
         def fold(add: Callable[[Slots, Carry], Carry], state: Carry) -> Carry:
             def add_words(words: HitWords, state: Carry, at_once: bool) -> Carry:
@@ -210,4 +220,4 @@ def fold_neighbors(
 
         return visit(Block(ids, fresh, fold), out)
 
-    return fold_block(jnp.int32(0), out) if engine.block_count == 1 else lax.fori_loop(0, engine.block_count, fold_block, out)
+    return fold_block(jnp.int32(0), out) if engine.block_count == 1 else lax.fori_loop(0, engine.used_blocks, fold_block, out)

@@ -3,7 +3,7 @@
 from jfrnn._geometry.batch import Batch, has_box, rank_systems
 from jfrnn._geometry.box import Box, round_box
 from jfrnn._geometry.box_cells import box_runs, most_cells, passes_of, sort_into_boxes
-from jfrnn._geometry.cell_line import FINE, Cells, Sorting, line_runs, sort_along_line, sort_queries
+from jfrnn._geometry.cell_line import FINE, CellLine, Cells, Sorting, line_runs, sort_along_line, sort_queries
 from jfrnn._geometry.cells import CellAxes, cell_edge, open_axes, ordered_bits
 from jfrnn._geometry.curves import hilbert_decode, hilbert_encode, morton_decode, morton_encode
 from jfrnn._geometry.cutoffs import (
@@ -69,10 +69,10 @@ from jfrnn._geometry.lattice import (
     shift_pairs,
     translation,
 )
-from jfrnn._geometry.levels import Axes, Levels, groups_of, level_runs, sort_by_levels
 from jfrnn._geometry.marks import ROWS_ARE_WHOLE, are_finite, are_whole, good_rows, mark_rows, one_or_nan
 from jfrnn._geometry.meshes import merge_vertices
 from jfrnn._geometry.motion import box_change, motion_of, turns_between
+from jfrnn._geometry.octaves import Part, octaves_of, parts_of
 from jfrnn._geometry.order import hilbert_order, sort_order
 from jfrnn._geometry.status import NeighborOverflowError, Status, known_status, names_of_bits, pairs_and_status, shape_of, tell
 from jfrnn._geometry.tree_order import CLASSES, order_for_tree

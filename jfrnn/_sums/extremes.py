@@ -105,7 +105,7 @@ def _find(relation: Relation, term: Term, operands: Groups, largest: bool) -> li
             summands = evaluate(relation, term, operands, block, slots)
             return [_better(old, _best_of(x if largest else -x, slots, n), n) for old, x in zip(state, summands, strict=True)]
 
-        done = block.fold(add, [start(block.query.size, like) for like in term.summands])
+        done = block.fold(add, jax.tree.map(lambda all_rows: all_rows[block.query], out))
         place = jnp.where(block.fresh, block.query, m)
         return jax.tree.map(lambda all_rows, some: all_rows.at[place].set(some, mode="drop"), out, done)
 

@@ -329,8 +329,8 @@ def sum_pairs(relation: Relation, term: Term, operands: Groups, compensated: boo
         kinds = {True: add_total, False: adder.add}
         adders = [kinds[total] for total in term.totals]
         begin = [
-            old if total else adder.zeros(block.query.shape, x)
-            for old, x, total in zip(out, term.summands, term.totals, strict=True)
+            old if total else jax.tree.map(lambda all_rows: all_rows[block.query], old)
+            for old, total in zip(out, term.totals, strict=True)
         ]
         done = block.fold(add, begin)
         place = jnp.where(block.fresh, block.query, rows)

@@ -39,12 +39,10 @@ def check_scene(scene: Scene) -> None:
     for name, place in (("tank", scene.tank), ("bounds", scene.bounds), ("sealed", scene.sealed), ("outflow", scene.outflow)):
         if place is not None:
             _check_corners(name, place.lower, place.upper, scene.dim)
+    if scene.bounds is not None and not np.isfinite([scene.bounds.lower, scene.bounds.upper]).all():
+        raise SceneError(f"bounds must be finite, for they are what pictures show, got {scene.bounds}.")
     if scene.periodic is not None:
-        box = scene.periodic
-        upper = [low + length for low, length in zip(box.lower, box.lengths, strict=False)]
-        _check_corners("periodic", box.lower, upper, scene.dim)
-        if len(box.axes) != scene.dim or not all(isinstance(axis, bool | np.bool_) for axis in box.axes):
-            raise SceneError(f"periodic.axes must say of each of {scene.dim} axes True or False, got {box.axes!r}.")
+        _check_periodic(scene.periodic, scene.dim)
     if scene.solid is not None:
         _check_solid(scene.solid, scene.dim)
     check_physics(scene.physics)
@@ -102,6 +100,8 @@ def _check_particles(scene: FluidScene | GasScene) -> None:
             raise SceneError(f"{name} are not finite: that of particle {int(np.argwhere(~np.isfinite(array))[0][0])} is not.")
         if name in ("masses", "densities") and not (array > 0).all():
             raise SceneError(f"{name} must be above 0: particle {int(np.argmin(array))} has {array.min()}.")
+        if name == "energies" and not (array >= 0).all():
+            raise SceneError(f"energies must not be below 0: particle {int(np.argmin(array))} has {array.min()}.")
     if scene.wall is not None:
         if not isinstance(scene.wall, np.ndarray | jax.Array) or scene.wall.shape != (n,) or scene.wall.dtype != bool:
             raise SceneError(f"wall must be an array of shape [{n}], bool, or None, got {_kind(scene.wall)}.")
@@ -110,12 +110,12 @@ def _check_particles(scene: FluidScene | GasScene) -> None:
 
 
 def _check_number(name: str, value: Any, least: float = 0.0) -> float:  # noqa: ANN401
-    """Return a finite number above a bound."""
+    """Return a finite number above a bound; of any sign, if that is -inf."""
     number = value if isinstance(value, int | float) else value.item() if isinstance(value, np.generic) else None
     if isinstance(number, bool) or not isinstance(number, int | float):
         raise SceneError(f"{name} must be a number, got {_kind(value)}.")
     if not least < number < math.inf:
-        raise SceneError(f"{name} must be a finite number above {least:g}, got {number!r}.")
+        raise SceneError(f"{name} must be a finite number{f' above {least:g}' if least > -math.inf else ''}, got {number!r}.")
     return float(number)
 
 
@@ -130,11 +130,26 @@ def _check_steps(scene: Scene) -> None:
         )
 
 
+def _check_vector(name: str, value: object, dim: int) -> np.ndarray:
+    """Return a number for each axis, of which some may be infinite."""
+    numbers = np.asarray(value) if isinstance(value, list | tuple | np.ndarray | jax.Array) else np.zeros(())
+    if numbers.shape != (dim,) or numbers.dtype.kind not in "fiu" or np.isnan(numbers).any():
+        raise SceneError(f"{name} must have a number for each of {dim} axes, got {_kind(value)}.")
+    return numbers
+
+
+def _check_periodic(box: fluids.Periodic, dim: int) -> None:
+    lower, lengths = (_check_vector(f"periodic.{part}", getattr(box, part), dim) for part in ("lower", "lengths"))
+    if not (np.isfinite(lower) & (lengths > 0) & np.isfinite(lengths)).all():
+        raise SceneError(f"periodic must have a finite lower corner and finite lengths above 0, got {box}.")
+    axes = np.asarray(box.axes)
+    if axes.shape != (dim,) or axes.dtype != bool:
+        raise SceneError(f"periodic.axes must say of each of {dim} axes True or False, got {box.axes!r}.")
+
+
 def _check_corners(name: str, lower: Sequence[float], upper: Sequence[float], dim: int) -> None:
-    for part, corner in (("lower", lower), ("lengths" if name == "periodic" else "upper", upper)):
-        numbers = np.asarray(corner)
-        if numbers.shape != (dim,) or numbers.dtype.kind not in "fiu" or np.isnan(numbers).any():
-            raise SceneError(f"{name}.{part} must have a number for each of {dim} axes, got {_kind(corner)}.")
+    for part, corner in (("lower", lower), ("upper", upper)):
+        _check_vector(f"{name}.{part}", corner, dim)
     if not all(low < high for low, high in zip(lower, upper, strict=True)):
         raise SceneError(f"{name} must reach from a lower to an upper corner, got {tuple(lower)!r} and {tuple(upper)!r}.")
 
@@ -148,11 +163,22 @@ def _check_solid(solid: fluids.Solid, dim: int) -> None:
         raise SceneError(f"solid.faces must be whole numbers from 0 to {len(vertices) - 1}, numbers of vertices.")
     if not isinstance(solid.thin, bool | None):
         raise SceneError(f"solid.thin must be True, False or None, got {_kind(solid.thin)}.")
-    if (turning := solid.turning) is not None:
-        wanted = {"center": turning.center, "axis": turning.axis} if dim == len("xyz") else {"center": turning.center}
-        for name, vector in wanted.items():
-            if vector is None or len(vector) != dim:
-                raise SceneError(f"solid.turning.{name} must have a number for each of {dim} axes, got {vector!r}.")
+    if not len(faces):
+        raise SceneError("solid.faces has no face: leave the solid out.")
+    if solid.turning is not None:
+        _check_turning(solid.turning, dim)
+
+
+def _check_turning(turning: object, dim: int) -> None:
+    if not isinstance(turning, fluids.Turning):
+        raise SceneError(f"solid.turning must be a Turning or None, got {_kind(turning)}.")
+    _check_number("solid.turning.rate", turning.rate, least=-math.inf)
+    vectors = {"center": turning.center} | ({"axis": turning.axis} if dim == len("xyz") else {})
+    for name, vector in vectors.items():
+        if not np.isfinite(_check_vector(f"solid.turning.{name}", vector, dim)).all():
+            raise SceneError(f"solid.turning.{name} must be finite, got {vector!r}.")
+    if dim == len("xyz") and not np.any(turning.axis):
+        raise SceneError("solid.turning.axis must have a length above 0, got 0 along each axis.")
 
 
 def check_physics(physics: Any) -> None:  # noqa: ANN401

@@ -110,8 +110,8 @@ def _run(given: argparse.Namespace) -> str:
     if given.scene.endswith(".toml"):
         if given.settings:
             raise SceneError(f"--set {given.settings[0]}: {given.scene} says all of its scene; change it there")
-        scene = toml_scenes.read_scene(given.scene)
-        how = replace(how, **toml_scenes.read_output(given.scene))
+        scene, output = toml_scenes.read_file(given.scene)
+        how = replace(how, **output)
     else:
         scene = settings.make_scene(given.scene, given.settings)
     scene = scene if given.initial is None else files.with_particles(scene, given.initial)

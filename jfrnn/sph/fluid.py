@@ -10,7 +10,7 @@ from jax import Array
 
 import jfrnn
 from jfrnn.cases.fluids import FluidScene, Physics
-from jfrnn.sph import budget, forces, solids, walls
+from jfrnn.sph import budget, forces, solids, viscosity, walls
 from jfrnn.sph.errors import SceneError
 from jfrnn.sph.forces import density_and_pressure
 from jfrnn.sph.kernels import KERNELS
@@ -76,6 +76,8 @@ def _check_parts(scene: FluidScene) -> None:
         )
     if scene.tank is not None and physics.restitution is None:
         raise SceneError("restitution must be a number from 0 to 1 in a tank, got None: take 1 for walls that take no speed away.")
+    if scene.dim != len("xy") and "source" in (physics.pressure, physics.viscosity_form):
+        raise SceneError("pressure and viscosity_form 'source' are forms in 2D, whose units are others in 3D: take another form.")
     if scene.solid is not None:
         _check_solid(physics)
     if physics.pressure == "difference" and scene.periodic is None and scene.wall is None:
@@ -110,8 +112,9 @@ def make_state(scene: FluidScene, dtype: type) -> State:
     """
     physics = scene.physics
     x, v = jnp.asarray(scene.positions, dtype), jnp.asarray(scene.velocities, dtype)
-    zero = jnp.zeros((), dtype)
-    state = State(x, v, zero, jnp.zeros_like(x), zero, solid=solids.begin(scene, x))
+    zero, solid = jnp.zeros((), dtype), solids.begin(scene, x)
+    solids.check_far(scene, x, solid)
+    state = State(x, v, zero, jnp.zeros_like(x), zero, solid=solid)
     if scene.outflow is not None:
         state = state._replace(gone=jnp.zeros(scene.n, bool))
     if physics.transport is not None or physics.shifting is not None:
@@ -151,7 +154,7 @@ def courant(model: Model, s: State) -> Array:
     speed = _greatest(s.v) if s.solid is None else _greatest(s.v) + solids.rim_speed(model, s.solid)
     limits = [0.25 * h / (physics.sound_speed + speed)]
     if physics.viscosity is not None:
-        kinematic = physics.viscosity / physics.density if physics.viscosity_form == "source" else physics.viscosity
+        kinematic = viscosity.kinematic(physics.viscosity_form, physics.viscosity, physics.density)
         limits.append((0.0625 if physics.viscosity_form == "fourth" else 0.125) * h**2 / kinematic)
     limits.append(0.25 * jnp.sqrt(h / jnp.maximum(_greatest(s.a), jnp.finfo(s.x.dtype).smallest_normal ** (1 / 3))))
     return physics.cfl / 0.25 * jnp.min(jnp.stack(limits))

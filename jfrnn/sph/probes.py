@@ -57,8 +57,11 @@ def flow_through(point: Sequence[float], normal: Sequence[float], width: float) 
     """
 
     def probe(model: Flow, s: State) -> Array:
-        n = jnp.asarray(np.asarray(normal, float) / np.linalg.norm(normal), s.x.dtype)
-        near = jnp.abs((s.x - jnp.asarray(point, s.x.dtype)) @ n) < width / 2
+        at, across = (_check_vector(*part, s.x.shape[1]) for part in (("point", point), ("normal", normal)))
+        if not width > 0 or not across.any():
+            raise SceneError(f"normal and width must not be 0, got {normal!r} and {width!r}.")
+        n = jnp.asarray(across / np.linalg.norm(across), s.x.dtype)
+        near = jnp.abs((s.x - jnp.asarray(at, s.x.dtype)) @ n) < width / 2
         return jnp.sum(jnp.where(near, mass_there(model, s) * (s.v @ n), 0)) / width
 
     return probe
@@ -73,7 +76,8 @@ def surface_height(place: Sequence[float], radius: float) -> Probe:
     """
 
     def probe(model: Flow, s: State) -> Array:
-        aside = jnp.linalg.norm(s.x[:, :-1] - jnp.asarray(place, s.x.dtype), axis=1)
+        at = _check_vector("place", place, s.x.shape[1] - 1)
+        aside = jnp.linalg.norm(s.x[:, :-1] - jnp.asarray(at, s.x.dtype), axis=1)
         there = (aside < radius) & (mass_there(model, s) > 0)
         return jnp.max(jnp.where(there, s.x[:, -1], -jnp.inf))
 
@@ -125,10 +129,30 @@ def force_on_solid(about: Sequence[float] | None = None) -> Probe:
 
 
 def _force_and_torque(forces: Array, x: Array, about: Sequence[float] | None) -> dict[str, Array]:
-    r = x if about is None else x - jnp.asarray(about, x.dtype)
+    r = x if about is None else x - jnp.asarray(_check_vector("about", about, x.shape[1]), x.dtype)
     if x.shape[1] == 2:
         return {"force": jnp.sum(forces, axis=0), "torque": jnp.sum(r[:, 0] * forces[:, 1] - r[:, 1] * forces[:, 0])}
     return {"force": jnp.sum(forces, axis=0), "torque": jnp.sum(jnp.cross(r, forces), axis=0)}
+
+
+def _check_vector(name: str, value: Sequence[float], count: int) -> np.ndarray:
+    array = np.asarray(value)
+    if array.shape != (count,) or array.dtype.kind not in "fiu" or not np.isfinite(array).all():
+        raise SceneError(f"{name} must be {count} finite numbers, got {value!r}.")
+    return array
+
+
+def check_names(probes: dict[str, Probe]) -> None:
+    """Refuse what are no functions by names that can stand in the head of a table.
+
+    Raises:
+        SceneError: Says which one.
+    """
+    if not isinstance(probes, dict):
+        raise SceneError(f"probes must be a dict of functions by name, got {type(probes).__name__}.")
+    for name, probe in probes.items():
+        if not isinstance(name, str) or not name or set(name) & set(',"\n') or not callable(probe):
+            raise SceneError(f"probes must be functions by names without a comma, got {name!r}: {probe!r}.")
 
 
 def columns(name: str, value: Any) -> dict[str, float]:  # noqa: ANN401

@@ -19,7 +19,7 @@ from jfrnn.sph.interrupts import hold_interrupts
 from jfrnn.sph.model import choose_dtype, make_model, make_state
 from jfrnn.sph.pairs import Neighbors
 from jfrnn.sph.particles import Flow, Force, GasModel, State, active
-from jfrnn.sph.probes import Probe, columns
+from jfrnn.sph.probes import Probe, check_names, columns
 from jfrnn.sph.progress import Progress
 
 
@@ -52,6 +52,7 @@ class How:
             SceneError: Names the field.
         """
         kinds = {"frames": int, "lines": int, "skin": float, "neighbors": Literal["auto", "pair_sum", "list"]}
+        kinds |= {"pictures": bool, "hdf": bool}
         bounds = {"frames": ranges.MANY, "lines": ranges.MANY, "skin": ranges.SKIN}
         for name, kind in kinds.items():
             value = getattr(self, name)
@@ -104,6 +105,7 @@ def run(
         KeyboardInterrupt: Ctrl-C came.
     """
     folder, dtype = Path(folder), choose_dtype(how.dtype)
+    check_names(probes or {})
     if how.hdf:
         series.check_library()
     with hold_interrupts() as stopped:
@@ -133,7 +135,8 @@ def run(
             write.snapshot(s, nbrs, step)
             rate = f"{(step - step_before) / (perf_counter() - start):.0f} steps/s"
             start, step_before = perf_counter(), step
-            text = f"{scene.name}: t {line['time']:.4g} s, {rate}, energy {line['total']:.4g} J"
+            unit = "J" if scene.dim == len("xyz") else "J/m"
+            text = f"{scene.name}: t {line['time']:.4g} s, {rate}, energy {line['total']:.4g} {unit}"
             progress.advance(text + ("" if nbrs is None else f", {int(nbrs.rebuild_count)} rebuilds"))
         progress.end()
         if how.pictures:
@@ -251,7 +254,7 @@ class _Writer:
             there = snapshots.are_there(scene, s)
             frames.draw(scene, there, x, v, time, float(top), self._folder / "frames" / f"{step:09d}.png")
         snapshots.save(s, scene, np.asarray(rho), np.asarray(p), self._folder / "snapshots", step)
-        snapshots.add_to_series(self._folder / f"{scene.name}.pvd", float(s.time), step)
+        snapshots.add_to_series(self._folder / f"{scene.name}.pvd", self._line["time"], step)
         self.series(step)
 
     def series(self, step: int) -> None:

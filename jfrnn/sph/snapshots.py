@@ -25,9 +25,14 @@ _OF_LINES = {
 }
 
 
+def time_of(s: State) -> float:
+    """Return the time [s] as its dtype writes it: of float32 0.02, not 0.019999999553."""
+    return float(str(np.asarray(s.time)))
+
+
 def are_there(scene: Scene, s: State) -> np.ndarray:
     """Return which particles have entered and not left, shape [n], bool."""
-    entered = np.ones(scene.n, bool) if scene.enters is None else scene.enters <= float(s.time)
+    entered = np.ones(scene.n, bool) if scene.enters is None else scene.enters <= time_of(s)
     return entered if s.gone is None else entered & ~np.asarray(s.gone)
 
 
@@ -114,7 +119,7 @@ def energies(model: Flow, state: State, scene: Scene) -> dict[str, float]:
     moved = budget.momentum(model, state)
     fluid = np.ones(scene.n, bool) if scene.wall is None else ~scene.wall
     line = {
-        "time": float(state.time),
+        "time": time_of(state),
         **(held := {name: float(value) for name, value in solver.energies(model, state).items()}),
         **{f"momentum_{axis}": float(moved[k]) for k, axis in enumerate("xyz"[: scene.dim])},
         "top_speed": float(np.linalg.norm(np.asarray(state.v)[fluid & are_there(scene, state)], axis=1).max(initial=0)),
@@ -175,5 +180,5 @@ def _write_vtk(arrays: dict[str, np.ndarray], scene: Scene, there: np.ndarray, v
         cloud.point_data[name] = value[there]
     if scene.wall is not None:
         cloud.point_data["wall"] = scene.wall[there].astype(np.uint8)
-    cloud.field_data["time"] = [float(arrays["time"])]
+    cloud.field_data["time"] = [float(str(arrays["time"]))]
     cloud.save(path)

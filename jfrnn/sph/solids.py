@@ -24,9 +24,11 @@ from jfrnn.cases import fluids
 from jfrnn.cases.fluids import FluidScene, Scene, Turning
 from jfrnn.sph import sight
 from jfrnn.sph.errors import SceneError
+from jfrnn.sph.inside import find_inside
 from jfrnn.sph.kernels import KERNELS, Kernel
 from jfrnn.sph.pairs import reach
 from jfrnn.sph.particles import Beside, Model, State, active
+from jfrnn.sph.viscosity import kinematic
 
 GAP = 0.2  # particle spacings: on a lattice, particles at a wall are half a spacing away
 _ROOM_AROUND = 2  # times the particles that are near a point in a fluid on a lattice
@@ -59,13 +61,7 @@ def begin(scene: FluidScene, x: Array, angle: Array | None = None) -> Beside | N
             "solid must be a closed mesh whose faces run counterclockwise as seen from the fluid: they run through one side more "
             "often one way than the other. If corners are written once per triangle, as in STL files, join them first."
         )
-    inside = np.asarray(signed.mask & (signed.distance < GAP / 2 * scene.spacing))
-    if scene.wall is not None:
-        inside = inside & ~scene.wall
-    if inside.any():
-        raise SceneError(
-            f"positions of the fluid must be outside the solid by {GAP / 2} spacings: particle {inside.argmax()} is not."
-        )
+    _refuse(scene, np.asarray(signed.mask & (signed.distance < GAP / 2 * scene.spacing)))
     corners = np.asarray(vertices)[solid.faces]
     asked = sight.points_to_ask(corners, cutoff)
     on_wall = jfrnn.search_triangles(asked[0], vertices, faces, cutoff)
@@ -78,6 +74,30 @@ def begin(scene: FluidScene, x: Array, angle: Array | None = None) -> Beside | N
         return seen
     neighbors = _neighbors(scene.spacing, cutoff, scene.dim)
     return _look_through(seen, at, sight.make_room(np.array([int(jnp.sum(tri.count > 0)), 0, 0]), neighbors, scene.n), neighbors)
+
+
+def _refuse(scene: FluidScene, inside: np.ndarray) -> None:
+    if scene.wall is not None:
+        inside = inside & ~scene.wall
+    if inside.any():
+        raise SceneError(
+            f"positions of the fluid must be outside the solid by {GAP / 2} spacings: particle {inside.argmax()} is not. If it "
+            "seems to be, the faces of the solid are inside out."
+        )
+
+
+def check_far(scene: FluidScene, x: Array, seen: Beside | None) -> None:
+    """Refuse a fluid that begins inside the solid, so deep that it sees no face: `begin` knows of those that do.
+
+    Raises:
+        SceneError: Names a particle.
+    """
+    if seen is None or scene.solid is None:
+        return
+    far, corners = ~np.asarray(seen.mask), np.asarray(scene.solid.vertices, np.float64)[scene.solid.faces]
+    inside = np.zeros(scene.n, bool)
+    inside[far] = find_inside(np.asarray(x, np.float64)[far], _reach(scene), corners)
+    _refuse(scene, inside)
 
 
 def _neighbors(spacing: float, cutoff: float, dim: int) -> float:
@@ -303,7 +323,8 @@ def push(model: Model, s: State, beside: Beside, rho: Array, p: Array) -> Array:
         along = along - jnp.sum(body * wall.normal, axis=1) * (wall.distance * wall.area + wall.weight)
     a = jnp.maximum(along, 0)[:, None] * wall.normal
     if physics.viscosity is not None and not physics.slip:
-        a = a - (2 * physics.viscosity * wall.area / jnp.maximum(wall.distance, model.spacing / 2))[:, None] * wall.slip
+        drag = 2 * kinematic(physics.viscosity_form, physics.viscosity, rho) * wall.area
+        a = a - (drag / jnp.maximum(wall.distance, model.spacing / 2))[:, None] * wall.slip
     return a
 
 
@@ -314,10 +335,10 @@ def load(model: Model, s: State, beside: Beside, rho: Array, p: Array) -> tuple[
     which a Laplacian needs the first only. The second changes neither the flow nor the force on a solid that is wet all around, but
     takes 2μω times its volume off the torque, as in a fluid that turns with it and does nothing to it.
     """
-    wall, onto = _find_acting(model, s, beside), -push(model, s, beside, rho, p)
-    if model.turning is not None and model.physics.viscosity is not None and not model.physics.slip:
+    physics, wall, onto = model.physics, _find_acting(model, s, beside), -push(model, s, beside, rho, p)
+    if model.turning is not None and physics.viscosity is not None and not physics.slip:
         spin = model.turning.rate * _across(wall.normal, model.turning)
-        onto = onto - (2 * model.physics.viscosity * wall.area)[:, None] * spin
+        onto = onto - (2 * kinematic(physics.viscosity_form, physics.viscosity, rho) * wall.area)[:, None] * spin
     return onto, s.x - wall.distance[:, None] * wall.normal
 
 

@@ -91,4 +91,9 @@ def artificial(pair: Pair, i: Values, j: Values, strength: Array) -> Array:
     return 2 * strength * pair.h * j["m"] * approach / ((pair.square + 0.01 * pair.h**2) * (i["rho"] + j["rho"]))
 
 
+def kinematic(form: str, viscosity: Array, rho: Array) -> Array:
+    """Return ν [m²/s]: of "source", whose viscosity is the dynamic one, μ/ρ."""
+    return viscosity / rho if form == "source" else viscosity
+
+
 VISCOSITIES = {"morris": morris, "volume": volume, "fourth": fourth, "source": source}

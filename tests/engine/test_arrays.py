@@ -214,11 +214,9 @@ MADE_FOR = [(searched, "cpu"), (slopes, "cuda"), (searched, "cpu", "cuda")]
 @pytest.mark.parametrize(("function", "platforms"), [(f, names) for f, *names in MADE_FOR], ids=["cpu", "cuda", "both"])
 def test_a_program_is_traced_for_its_platforms_alone(function, platforms, monkeypatch):
     """A search, or the gradient of a sum."""
-    used, rows, fold = [], arrays.find_candidates, rows_module.find_candidates
-    monkeypatch.setattr(
-        arrays, "find_candidates", lambda search, by_cells, tuning: used.append(tuning) or rows(search, by_cells, tuning)
-    )
-    monkeypatch.setattr(rows_module, "find_candidates", lambda *given: used.append(given[2]) or fold(*given))
+    used, fold = [], arrays.fold_candidates
+    for module in (arrays, rows_module):
+        monkeypatch.setattr(module, "fold_candidates", lambda *given: used.append(given[2]) or fold(*given))
     jax.export.export(jax.jit(function), platforms=platforms)(jax.ShapeDtypeStruct((601, 3), np.float32))
     numbers = {"cpu": tuning.CPU, "cuda": tuning.ACCELERATOR}
     assert set(used) == {numbers[name] for name in platforms}

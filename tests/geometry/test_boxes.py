@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
+from by_numpy import in_order
 from checked import padded
-from test_box import LONG, arrays_of, energy_and_slopes, masked_images, unpacked
-from test_box import oracle as lattice_oracle
+from test_box import LONG, energy_and_slopes, masked_images, unpacked
 
 import jfrnn
 from jfrnn.cases.crystals import CRYSTAL_CASES
@@ -19,18 +19,27 @@ SLOW = pytest.mark.slow
 CAPACITY = {2: 96, 3: 256}
 
 
-def oracle(boxes, x, batch, cutoff, periodic=None, queries=None, query_batch=None, **options):
-    """Return (i, j, S) of all pairs, system by system."""
+def system_by_system(find, boxes, x, batch, periodic=None, queries=None, query_batch=None):
+    """Return (i, j, S) of all pairs; `find` asks the oracle for those of the sources and queries of a system, by their numbers."""
     found = set()
     for system, box in enumerate(np.asarray(boxes, x.dtype)):
         flags = np.ones(x.shape[1], bool) if periodic is None else np.broadcast_to(np.asarray(periodic), boxes.shape[:2])[system]
-        matrix, ends = np.diag(box) if box.ndim == 1 else box, np.flatnonzero(batch == system)
+        kind = {"matrix": np.diag(box) if box.ndim == 1 else box, "periodic": flags.tolist()}
+        ends = np.flatnonzero(batch == system)
         starts = ends if queries is None else np.flatnonzero(query_batch == system)
-        asking = {} if queries is None else {"queries": queries[starts]}
         if len(ends) and len(starts):
-            pairs = reference.reference_images(x[ends], cutoff, matrix=matrix, periodic=flags.tolist(), **asking, **options)
+            pairs = find(ends, starts, **kind, **({} if queries is None else {"queries": queries[starts]}))
             found |= {(int(starts[i]), int(ends[j]), shift) for i, j, shift in pairs}
     return found
+
+
+def oracle(boxes, x, batch, cutoff, periodic=None, queries=None, query_batch=None, **options):
+    """Return (i, j, S) of all pairs, system by system."""
+
+    def find(ends, starts, **kind):
+        return reference.reference_images(x[ends], cutoff, **kind, **options)
+
+    return system_by_system(find, boxes, x, batch, periodic, queries, query_batch)
 
 
 @functools.lru_cache(maxsize=32)
@@ -156,7 +165,7 @@ def test_skin_in_moving_boxes(backend):
 def test_derivatives_in_positions_and_boxes(ways):
     """Sums over the pairs of the oracle, and their derivatives."""
     x, batch, boxes = crystals()
-    pairs = arrays_of(expected_images("mixed", np.float64, 2))
+    pairs = in_order(expected_images("mixed", np.float64, 2), 2)
     total, capacity = len(pairs[0]), CAPACITY[2]
     nbrs = jfrnn.search(x, 0.75, box=jfrnn.Box(boxes), batch=batch, backend="warp", capacity=capacity)
 
@@ -242,11 +251,7 @@ def test_lattices_far_from_reduced(backend, options):
         x = np.einsum("nd,ndk->nk", rng.uniform(0, 1, (21, 3)) + whole, boxes[batch]).astype(dtype)
         nbrs = search(x, jfrnn.Box(boxes, images=2))
         nbrs.check()
-        expected = set()
-        for system, matrix in enumerate(boxes):
-            ends = np.flatnonzero(batch == system)
-            pairs = lattice_oracle(x[ends], 0.6, matrix, **options)
-            expected |= {(int(ends[i]), int(ends[j]), shift) for i, j, shift in pairs}
+        expected = oracle(boxes, x, batch, 0.6, **options)
         assert masked_images(nbrs, x) == expected
         assert int(nbrs.count.sum()) == len(expected) > 30
     assert len(traces) == 1

@@ -8,8 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
-from test_box import arrays_of, masked_images, pull_back
-from test_boxes import box_of, listed_images
+from by_numpy import in_order
+from test_box import masked_images, pull_back
+from test_boxes import box_of, listed_images, system_by_system
 
 import jfrnn
 from jfrnn._geometry.cutoffs import RULES
@@ -20,29 +21,17 @@ CAPACITY = {2: 96, 3: 256}
 TABLE = np.array([[0.75, 0, 0.5], [0, 0, 0.875], [0.5, 0.875, 0.375]])  # the second species has no neighbors of its own
 
 
-def oracle(who, boxes, x, batch, given, periodic=None, queries=None, query_batch=None, **options):
+def oracle(who, boxes, x, batch, given, periodic=None, queries=None, query_batch=None, table=TABLE, **options):
     """Return (i, j, S) of all pairs, system by system; `given` are the radii or species of sources and of queries."""
-    found, (of_sources, of_queries) = set(), given
-    for system, box in enumerate(np.asarray(boxes, x.dtype)):
-        flags = np.ones(x.shape[1], bool) if periodic is None else np.broadcast_to(np.asarray(periodic), boxes.shape[:2])[system]
-        matrix, ends = np.diag(box) if box.ndim == 1 else box, np.flatnonzero(batch == system)
-        starts = ends if queries is None else np.flatnonzero(query_batch == system)
-        if not (len(ends) and len(starts)):
-            continue
-        more = {
-            "matrix": matrix,
-            "periodic": flags.tolist(),
-            **options,
-            **({} if queries is None else {"queries": queries[starts]}),
-        }
+    of_sources, of_queries = given
+
+    def find(ends, starts, **kind):
+        own = {} if queries is None else {"query_species" if who == "table" else "query_radii": of_queries[starts]}
         if who == "table":
-            more |= {} if queries is None else {"query_species": of_queries[starts]}
-            pairs = reference.reference_species(x[ends], TABLE.astype(x.dtype), of_sources[ends], **more)
-        else:
-            more |= {} if queries is None else {"query_radii": of_queries[starts]}
-            pairs = reference.reference_radii(x[ends], of_sources[ends], who, **more)
-        found |= {(int(starts[i]), int(ends[j]), shift) for i, j, shift in pairs}
-    return found
+            return reference.reference_species(x[ends], table.astype(x.dtype), of_sources[ends], **own, **kind, **options)
+        return reference.reference_radii(x[ends], of_sources[ends], who, **own, **kind, **options)
+
+    return system_by_system(find, boxes, x, batch, periodic, queries, query_batch)
 
 
 class Scene:
@@ -145,18 +134,9 @@ def test_skin_while_cutoffs_and_boxes_change(who, backend):
     update = jax.jit(lambda nbrs, x, boxes, cutoff: nbrs.update(x, box=jfrnn.Box(boxes), cutoff=cutoff))
 
     def expected(scale):
-        of_points = given.of_points if who == "table" else [given.of_points[0] * scale, None]
-        if who != "table":
-            return oracle(who, boxes, x, batch, of_points)
-        found = set()
-        for system, matrix in enumerate(boxes):
-            at = np.flatnonzero(batch == system)
-            if len(at):
-                near = reference.reference_species(
-                    x[at], TABLE.astype(np.float32) * scale, of_points[0][at], matrix=matrix, periodic=(True, True)
-                )
-                found |= {(int(at[i]), int(at[j]), s) for i, j, s in near}
-        return found
+        if who == "table":
+            return oracle(who, boxes, x, batch, given.of_points, table=TABLE.astype(np.float32) * scale)
+        return oracle(who, boxes, x, batch, [given.of_points[0] * scale, None])
 
     for step in range(6):
         scale = np.float32(1 + 0.002 * step)
@@ -181,7 +161,7 @@ def test_sums_and_derivatives_in_positions_and_boxes(who, backend, way):
     """Sums over the oracle's pairs, their gradient, and with a table that of its norm, by a complex step."""
     given = scene("mixed", np.float64, 2, who)
     x, boxes, batch, m = given.x, given.given.boxes, given.batch, np.random.default_rng(4).uniform(0, 1, len(given.x))
-    i, j, shifts = pairs = arrays_of(given.pairs())
+    i, j, shifts = pairs = in_order(given.pairs(), 2)
     reach, weights = box_of(given.given).images_for(float(np.max(given.cutoff))), np.arange(1.0, len(x) + 1)
     nbrs = given.search(backend, capacity=CAPACITY[2]) if way == "list" else None
 

@@ -1,9 +1,8 @@
-"""Cells: the exact floor, neighbors that touch, gaps that close, and both ways to look a cell up."""
+"""Cells: the exact floor, and neighbors that touch."""
 
 from fractions import Fraction
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -70,54 +69,7 @@ def test_no_pair_is_two_cells_apart(dtype, cutoff, reach):
     assert np.min(cells[1] - cells[0]) >= 0
 
 
-def test_gaps_close_and_contacts_stay():
-    cells = np.array([7.0, -3.0, 8.0, 1e30, 7.0, 100.0, -np.inf])
-    np.testing.assert_array_equal(jax.jit(_cells._squeeze_gaps)(cells), [4, 2, 5, 9, 4, 7, 0])
-
-
 def test_flushed_denormals_stay_within_the_edge_s_margin(dtype):
     """A negative denormal may count as 0 and land one cell up: the edge exceeds every cutoff by more than a denormal."""
     cutoff = dtype(np.nextafter(dtype(2 * smallest_cutoff(np.dtype(dtype))), dtype(0)))
     assert Fraction(float(edge_of(cutoff, dtype))) - Fraction(float(cutoff)) > 2 * Fraction(float(np.finfo(dtype).tiny))
-
-
-@jax.jit
-def coordinates(x, edge):
-    return _cells.grid_coordinates(x, _cells.open_axes(edge, 3), jnp.ones(x.shape[1], bool))
-
-
-@pytest.mark.parametrize("spread", [1.0, 1e3, 1e6, 1e12])
-def test_extent_is_bounded_by_the_particles(dtype, spread):
-    rng = np.random.default_rng(3)
-    x = rng.uniform(-spread, spread, (3, 50)).astype(dtype)
-    coords, extent = map(np.asarray, coordinates(x, edge_of(0.5, dtype)))
-    assert (coords >= 1).all()
-    assert (coords < extent[:, None] - 1).all()
-    assert (extent <= max(_cells._SMALLEST_TABLE, 2 * 50 + 2)).all()
-
-
-@jax.jit
-def rows_of(coords, finite, asked, dense):
-    """Return the grid, the order of cells that a search among them takes, and which places of it rows of three cells take."""
-    grid = _cells.build_grid(coords, finite, jnp.array([7, 7, 7], jnp.int32), 80)
-    x, y, z = (c[:, None] for c in asked)
-    order = _cells.cell_order(coords, finite, grid.extent, dense)
-    return grid, order, *_cells.places_between(grid._replace(dense=dense), [x - 1, x + 1, y, z])
-
-
-@pytest.mark.parametrize("dense", [True, False])
-def test_table_and_binary_search_find_the_same_rows(dense):
-    rng = np.random.default_rng(4)
-    coords, finite = rng.integers(1, 6, (3, 80)).astype(np.int32), rng.random(80) > 0.1
-    asked = rng.integers(1, 6, (3, 40)).astype(np.int32)
-    grid, order, start, stop = rows_of(coords, finite, asked, dense)
-    assert grid.dense
-    np.testing.assert_array_equal(order, grid.order)
-    start, stop = np.asarray(start), np.asarray(stop)
-    found = [set(range(a, b)) for a, b in zip(start[:, 0].tolist(), stop[:, 0].tolist(), strict=True)]
-    sorted_coords = np.asarray(grid.coords).T
-    for q, of_query in enumerate(found):
-        near = np.abs(sorted_coords - asked[:, q]) <= [1, 0, 0]
-        assert of_query == set(np.flatnonzero(near.all(axis=1)).tolist())
-    assert sorted(grid.order.tolist()) == list(range(80))
-    assert not finite[np.asarray(grid.order)[finite.sum() :]].any()

@@ -25,10 +25,7 @@ CELLS = {
     "fcc": [[0, 1.8, 1.8], [1.8, 0, 1.8], [1.8, 1.8, 0]],
 }
 # What each case of the default run tells, one program each; those by hand tell all.
-ASKED = {
-    ("short", "warp", 5000, np.float64): ("count", "sums", "sums of the list"),
-    ("fcc", "warp", 500, np.float32): ("edges",),
-}
+ASKED = {("short", "warp", 5000, np.float64): ("count", "sums", "sums of the list"), ("fcc", "warp", 500, np.float32): ("edges",)}
 ALL = ("count", "sums", "sums of the list", "edges", "edges of the list")
 
 

@@ -7,7 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
-from test_box import arrays_of, image_pairs, masked_images, pull_back
+from by_numpy import in_order
+from test_box import image_pairs, masked_images, pull_back
 from test_boxes import oracle as oracle_of_systems
 
 import jfrnn
@@ -155,7 +156,7 @@ def test_derivatives_in_coordinates_and_vectors_are_those_of_the_product(way, pe
     u, batch = np.asarray(points(np.float64, 4)), np.arange(N) % 3 if per_system else np.zeros(N, int)
     cells = CELLS if per_system else SKEWED[None]
     real = np.concatenate([exact(p[None], cells[k], np.float64) for p, k in zip(u, batch)])
-    i, j, shifts = arrays_of(oracle_of_systems(cells, real, batch, 0.6))
+    i, j, shifts = in_order(oracle_of_systems(cells, real, batch, 0.6), real.shape[1])
     images, weights = jfrnn.Box(CELLS if per_system else SKEWED).images_for(0.6), np.cos(np.arange(N))
     more = {"batch": batch} if per_system else {}
 

@@ -365,11 +365,7 @@ X, H = np.zeros((4, 3), np.float32), np.ones(4, np.float32)
         ),
         (TypeError, "cutoff must be a number, or an array of floats with one per particle", lambda: jfrnn.search(X, H.astype(int))),
         (TypeError, "cutoff must be a number, got str", lambda: jfrnn.search(X, "far")),
-        (
-            ValueError,
-            r"cutoff must be a number, or have shape \[2\], one per query",
-            lambda: jfrnn.search(X, H, queries=X[:2]),
-        ),
+        (ValueError, r"cutoff must be a number, or have shape \[2\], one per query", lambda: jfrnn.search(X, H, queries=X[:2])),
         (
             ValueError,
             r"cutoff must be a pair of arrays, of the positions \[4\] and of the queries \[2\].*'mean'",

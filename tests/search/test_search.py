@@ -260,9 +260,7 @@ def test_scan_and_cond(backend):
 
     def step(x, t):
         count = jax.lax.cond(
-            t > 1,
-            lambda: jfrnn.search(x, 0.2, capacity=60, backend=backend).count,
-            lambda: jfrnn.count(x, 0.1, backend=backend),
+            t > 1, lambda: jfrnn.search(x, 0.2, capacity=60, backend=backend).count, lambda: jfrnn.count(x, 0.1, backend=backend)
         )
         return x * 1.5, count
 

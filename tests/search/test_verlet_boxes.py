@@ -77,11 +77,7 @@ KINDS = {
 }
 
 
-EACH = [
-    (np.float64, "slab", "queries"),
-    (np.float32, "orthogonal", "half"),
-    (np.float64, "long, own images", "half"),
-]
+EACH = [(np.float64, "slab", "queries"), (np.float32, "orthogonal", "half"), (np.float64, "long, own images", "half")]
 UPDATED = ("long, own images",)  # in lists of other kinds, tests below ask whether wrapping is motion; by hand all
 ALL = [(dtype, kind, asked) for dtype in (np.float32, np.float64) for kind in KINDS for asked in ("own", "half", "queries")]
 

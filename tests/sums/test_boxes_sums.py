@@ -5,9 +5,9 @@ import functools
 import jax
 import numpy as np
 import pytest
+from marked import assert_marks, marks
 from test_boxes import CAPACITY, box_of, expected_images
 from test_kept_cuda import compiles, term_of
-from test_pair_sum_warp_boxes import assert_marks, marks
 
 import jfrnn
 from jfrnn.cases.crystals import CRYSTAL_CASES

@@ -1,7 +1,6 @@
 """`pair_sum` with its term inside the kernel: the pairs of `search`, and the sums of the other engines."""
 
 import functools
-import math
 import warnings
 
 import checked
@@ -10,14 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
+from by_numpy import add_up, in_order
+from marked import assert_compensated, assert_marks, cancelling, marks
 from test_pair_sum import (
     CUTOFF,
     HARD,
     LENGTH,
     SLOW,
     N,
-    add_rows,
-    arrays_of,
     assert_same,
     everything,
     oracle,
@@ -68,32 +67,10 @@ def test_integers_travel_whose_bits_are_no_usual_floats(box):
 
     found = jax.jit(lambda x, kinds: fused(same, x, 0.3, kinds, box=box))(x, kinds)
     pairs = reference.reference_images(x, 0.3, matrix=np.ones(3), periodic=(box is not None,) * 3)
-    i, j, _ = arrays_of(pairs, 3)
+    i, j, _ = in_order(pairs, 3)
     expected = [np.bincount(i[kinds[j] == k], minlength=300) for k in bits]
     assert all(total.sum() > 1000 for total in expected)
     np.testing.assert_array_equal(np.stack(found), np.stack(expected))
-
-
-def marks(r, i, j):
-    """Tell pairs apart by whole numbers, which no order of summation rounds, and by the displacement."""
-    return {"count": 1.0, "ids": j, "rests": (j * j) % 61, "rows": i, "r": r}
-
-
-def assert_marks(found, pairs, x, q=None):
-    q = x if q is None else q
-    i, j, _ = arrays_of(pairs, x.shape[1])
-    (m, d), eps = q.shape, np.finfo(x.dtype).eps
-    counts, r = np.bincount(i, minlength=m), x.astype(np.float64)[j] - q.astype(np.float64)[i]
-    found = checked.with_sums(found, q)
-    np.testing.assert_array_equal(found["count"], counts)
-    np.testing.assert_array_equal(found["ids"], np.bincount(i, j, m))
-    np.testing.assert_array_equal(found["rests"], np.bincount(i, j * j % 61, m))
-    np.testing.assert_array_equal(found["rows"], counts * np.arange(m))
-    for k in range(d):
-        with np.errstate(over="ignore"):
-            error, total = np.abs(found["r"][:, k] - np.bincount(i, r[:, k], m)), np.bincount(i, np.abs(r[:, k]), m)
-        bounded = total < np.finfo(x.dtype).max / 4
-        assert (error <= 4 * eps * np.sqrt(counts) * total)[bounded].all()
 
 
 def marked(x, cutoff, queries=None, **options):
@@ -138,19 +115,9 @@ def test_empty(n, m):
 
 def test_more_candidates_than_fit():
     """Sums go on where a cell has more candidates than are held at a time; compensated ones with their errors."""
-    random = np.random.default_rng(0)
-    n, eps = 3000, np.finfo(np.float32).eps
-    values = (random.standard_normal(n) * 10 ** random.uniform(-3, 5, n)).astype(np.float32)
-    values[n // 2 :] = -values[: n // 2] * np.float32(1 + 1e-5)
-    x = np.zeros((n, 2), np.float32)
-    plain, compensated = (
-        np.asarray(fused(lambda r, i, j: j, x, 1.0, values, include_self=True, compensated=c), np.float64) for c in (False, True)
-    )
-    exact, total = math.fsum(values.tolist()), math.fsum(np.abs(values).tolist())
-    bound = 2 * eps * abs(exact) + 4 * eps**2 * n * total
-    assert np.abs(plain - exact).max() <= 4 * eps * math.sqrt(n) * total
-    assert np.abs(compensated - exact).max() <= bound
-    assert np.abs(plain - exact).max() > 2 * bound  # else this would prove nothing (lanes of a GPU add up parts, which loses less)
+    values, x = cancelling(3000), np.zeros((3000, 2), np.float32)
+    both = (fused(lambda r, i, j: j, x, 1.0, values, include_self=True, compensated=c) for c in (False, True))
+    assert_compensated(*both, values, worse=2)  # lanes of a GPU add up parts, which loses less
 
 
 def light(r, i, j):
@@ -226,14 +193,14 @@ def test_values_of_all_kinds(dtype):
     values |= {"kind": jnp.asarray(random.integers(-5, 5, 400), np.int32), "heavy": jnp.asarray(random.random(400) < 0.5)}
     fn = functools.partial(of_all_kinds, jnp.asarray(1.5, dtype))
     found = fused(fn, x, 0.3, values)
-    i, j, _ = arrays_of(reference.reference_pairs(x, 0.3), 3)
+    i, j, _ = in_order(reference.reference_pairs(x, 0.3), 3)
     points, matrix, vector, kind, truth = (
         np.asarray(a).astype(dtype) for a in (x, *map(values.get, ("matrix", "vector", "kind", "heavy")))
     )
     r, whole = points[j] - points[i], np.where(truth[j] > 0, kind[j] - 2 * kind[i], 3)
     terms = {"outer": r[:, :, None] * vector[j][:, None], "rest": [1.5 * whole, np.maximum(r, 0)]}
     terms["turned"] = np.einsum("pab,pb->pa", matrix[j], vector[i] - vector[j])
-    assert_same(found, jax.tree.map(lambda t: add_rows(i, t, 400).astype(dtype), terms), 100 * np.finfo(dtype).eps)
+    assert_same(found, jax.tree.map(lambda t: add_up(t, i, 400).astype(dtype), terms), 100 * np.finfo(dtype).eps)
     again = jax.jit(lambda x: fused(fn, x, 0.3, values))(x)
     jax.tree.map(np.testing.assert_array_equal, found, again)
 
@@ -402,11 +369,7 @@ def with_strange_slope(r, i, j):
         (_translate.NoTranslationError, "the primitive 'sort' has no translation", lambda: fused(sorted_norm, X, 1.0)),
         (_translate.NoTranslationError, "the primitive 'sort'", lambda: derivative_without_translation(jnp.asarray(X))),
         (TypeError, "fn returns int32: convert it, or pass backend='jax'", lambda: fused(lambda r, i, j: jnp.int32(1), X, 1.0)),
-        (
-            TypeError,
-            "values of bool, float32, int32, fn gets or closes over float64",
-            lambda: fused(second, X, 1.0, np.ones(4)),
-        ),
+        (TypeError, "values of bool, float32, int32, fn gets or closes over float64", lambda: fused(second, X, 1.0, np.ones(4))),
     ],
 )
 def test_errors(error, match, call):
@@ -428,7 +391,7 @@ def test_tables_are_read_by_species():
         return sums.sum(), sums
 
     found = jax.jit(jax.grad(energy, (0, 1), has_aux=True))(x, table)
-    i, j, _ = arrays_of(reference.reference_pairs(x, 0.3), 3)
+    i, j, _ = in_order(reference.reference_pairs(x, 0.3), 3)
     r, factor = x[j] - x[i], (table[kind[i], kind[j]] + table[kind[j], kind[i]])[:, None]
     by_table = np.bincount(3 * (kind[i] % 3) + kind[j] % 3, (r**2).sum(1), 9).reshape(3, 3)
     by_place = np.zeros_like(x)

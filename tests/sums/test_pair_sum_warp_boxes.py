@@ -8,20 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
-from test_pair_sum import (
-    CUTOFF,
-    SLOW,
-    N,
-    arrays_of,
-    assert_same,
-    everything,
-    moved,
-    oracle,
-    scene,
-    smooth,
-    smooth_slopes,
-    tangents_of,
-)
+from marked import assert_marks, marks
+from test_pair_sum import CUTOFF, SLOW, N, assert_same, everything, moved, oracle, scene, smooth, smooth_slopes, tangents_of
 
 import jfrnn
 from jfrnn.cases.batches import BATCH_CASES
@@ -30,36 +18,6 @@ from jfrnn.cases.periodic import PERIODIC_CASES
 fused = functools.partial(jfrnn.pair_sum, backend="warp")
 NEAREST = ["outside_100", "faces", "ulp_across_100"]
 NAMES = [*NEAREST, "thin_slab", "skewed_3_small", "queries_many_images"]
-
-
-def marks(r, i, j):
-    """Tell pairs apart by whole numbers, which no order of summation rounds, and by the displacement."""
-    return {"count": 1.0, "ids": j, "rests": (j * j) % 61, "rows": i, "r": r, "square": r @ r}
-
-
-def assert_marks(found, pairs, x, q, matrix):
-    """Compare sums with those over the oracle's pairs; of displacements but for the rounding of their terms and of the sum.
-
-    `matrix` is that of all pairs or, [m, d, d], of each row.
-    """
-    (m, d), eps, found = q.shape, np.finfo(x.dtype).eps, checked.with_sums(found, q)
-    i, j, shifts = arrays_of(pairs, d)
-    matrix = (np.diag(matrix) if matrix.ndim == 1 else matrix).astype(np.float64)
-    matrix = matrix[i] if matrix.ndim == 3 else np.broadcast_to(matrix, (len(i), d, d))
-    x, q, counts = x.astype(np.float64), q.astype(np.float64), np.bincount(i, minlength=m)
-    np.testing.assert_array_equal(found["count"], counts)
-    np.testing.assert_array_equal(found["ids"], np.bincount(i, j, m))
-    np.testing.assert_array_equal(found["rests"], np.bincount(i, j * j % 61, m))
-    np.testing.assert_array_equal(found["rows"], counts * np.arange(m))
-    r = x[j] - q[i] + np.einsum("pk,pkd->pd", shifts, matrix)
-    spans = np.einsum("pk,pkd->pd", np.abs(shifts), np.abs(matrix))
-    wrong = 2 * eps * (np.abs(x[j]) + np.abs(q[i]) + spans)  # rounding of each component
-    terms = {"square": ((r**2).sum(axis=1), (2 * np.abs(r) * wrong + wrong**2).sum(axis=1))}
-    terms |= {k: (r[:, k], wrong[:, k]) for k in range(d)}
-    for key, (term, each) in terms.items():
-        sums = found["square"] if key == "square" else found["r"][:, key]
-        allowed = np.bincount(i, each, m) + 4 * eps * np.sqrt(counts) * np.bincount(i, np.abs(term), m)
-        assert (np.abs(sums - np.bincount(i, term, m)) <= allowed).all()
 
 
 def marked(given, box, alone, **options):
@@ -80,7 +38,7 @@ def assert_case(name, dtype, dim, **options):
     found = marked(given, jfrnn.Box(given.matrix, given.periodic), name not in NEAREST, **options)
     kind = {"matrix": given.matrix, "periodic": given.periodic, "queries": given.queries}
     pairs = reference.reference_images(given.positions, given.cutoff, **kind, **options)
-    assert_marks(found, pairs, given.positions, given.positions if given.queries is None else given.queries, given.matrix)
+    assert_marks(found, pairs, given.positions, given.queries, given.matrix)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -113,7 +71,7 @@ def test_where_no_pair_crosses_the_box(fn):
     sums = jax.jit(lambda x: fused(fn, x, 0.5, ids, box=jfrnn.Box(lengths)))
     for at in (x, outside, beside):
         pairs = reference.reference_images(at, 0.5, matrix=np.diag(lengths), periodic=(True, True))
-        assert_marks(sums(at), pairs, at, at, lengths)
+        assert_marks(sums(at), pairs, at, matrix=lengths)
 
 
 @pytest.mark.slow
@@ -142,13 +100,8 @@ def test_batches(name):
 
     found = sums(checked.padded(given.positions, 300), given.lengths)
     pairs = reference.reference_images(given.positions, given.cutoff, matrix=given.lengths, periodic=(True, True))
-    assert_marks(
-        found,
-        {(i, j, s) for i, j, s in pairs if given.batch[i] == given.batch[j]},
-        given.positions,
-        given.positions,
-        given.lengths,
-    )
+    together = {(i, j, s) for i, j, s in pairs if given.batch[i] == given.batch[j]}
+    assert_marks(found, together, given.positions, matrix=given.lengths)
 
 
 # --- derivatives -------------------------------------------------------------------------------------------------------------

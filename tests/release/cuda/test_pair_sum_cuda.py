@@ -113,8 +113,7 @@ def test_terms_in_boxes_compile(dim, dtype, length):
 
 
 @pytest.mark.parametrize(
-    ("dtype", "variant"),
-    [pytest.param(np.float32, {}, marks=pytest.mark.slow), (np.float64, {"periodic": 2, "batched": True})],
+    ("dtype", "variant"), [pytest.param(np.float32, {}, marks=pytest.mark.slow), (np.float64, {"periodic": 2, "batched": True})]
 )
 def test_extremes_compile(dtype, variant):
     masses, x, _, _ = arguments(dtype, 3)

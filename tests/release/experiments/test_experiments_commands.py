@@ -18,7 +18,7 @@ ROOT = Path(_commands.__file__).resolve().parent.parent
 CONFIGS = ROOT / "experiments" / "configs"
 TOP = ("run", "init", "report", "tables", "merge", "list", "show", "export", "gpu", "bench", "sph")
 BENCH = (
-    *("crossover", "crystals", "distributed", "arrays", "latency", "lj", "options", "peers", "skin", "start", "guides"),
+    *("crystals", "distributed", "arrays", "latency", "lj", "options", "peers", "skin", "start", "guides"),
     *("structures", "sums", "ties", "triangles"),
 )
 SPH = ("validate", "speed", "gradients", "peers", "thin", "start")
@@ -90,7 +90,7 @@ def test_list_says_what_there_is():
         (("bench", "triangles", "--backend", "brute"), "--backend brute: allowed: warp, bvh, jax"),
         (("bench", "triangles", "--cutoff", "0"), "--cutoff 0: "),
         (("bench", "triangles", "--faces", "1"), "--faces 1: "),
-        (("bench", "crossover", "--repeats", "1"), "--repeats 1: "),
+        (("bench", "structures", "--repeats", "1"), "--repeats 1: "),
         (("bench", "peers", "--limit", "nan"), "--limit nan: "),
         (("bench", "latency", "--sizes", "1"), "--sizes 1: "),
         (("bench", "latency", "--repeats", "1"), "--repeats 1: "),
@@ -182,7 +182,7 @@ def test_steps_are_timed_of_scenes_that_have_an_nx(tmp_path):
         ("sph", "peers"),
         ("sph", "start"),
         ("sph", "thin"),
-        *(("bench", name) for name in ("options", "ties", "crossover", "triangles", "skin", "latency", "start")),
+        *(("bench", name) for name in ("options", "ties", "triangles", "skin", "latency", "start")),
         ("bench", "peers", "scipy"),
     ],
     ids=lambda arguments: " ".join(map(str, arguments[:2])),
@@ -206,8 +206,6 @@ def test_files_that_cannot_be_written_name_their_option(tmp_path):
 
 def test_folders_that_hold_something_else(tmp_path):
     rows = tmp_path / "rows.jsonl"
-    rows.write_bytes(b'{"kind": "ceiling"}\n')
-    assert refused("report", tmp_path).startswith(f"{rows}: holds no rows of a GPU run")
     for text in (b"no json\n", b"[]\n", b"\xff\xff\n"):
         rows.write_bytes(text)
         assert refused("report", tmp_path).startswith(f"{rows}: line 1 is no row")

@@ -9,11 +9,13 @@ import jax
 import numpy as np
 import pytest
 from places import ROOT
+from typer.testing import CliRunner
 
 from experiments import _compare, _config
+from experiments._cli import app
 from experiments._errors import UsageError
 from experiments.bench.triangles import gear
-from experiments.gpu import exactness, report, run, sums, timings, triangles
+from experiments.gpu import exactness, run, sums, timings, triangles
 from experiments.gpu.config import Config
 
 CONFIG = ROOT / "experiments" / "configs" / "h200.toml"
@@ -139,9 +141,9 @@ def test_triangles_are_decided_timed_and_reported(tmp_path, monkeypatch):
     assert all((row["wrong"], row["same_bits_twice"]) == (0, True) and row["median_s"] > 0 for row in rows[2:])
     assert {row["pairs"] for row in rows[2:]} == {rows[-1]["pairs"]}
     assert rows[0]["wrong"] == 0
-    text = report.report(tmp_path)
-    assert "| jfrnn warp, scan of updates |" in text
-    assert "| jfrnn bvh, rebuild |" in text
+    text = CliRunner().invoke(app, ["report", str(tmp_path)]).stdout
+    assert "jfrnn warp, scan of updates" in text
+    assert "jfrnn bvh, rebuild" in text
 
 
 def test_a_wrong_list_of_triangles_is_counted(monkeypatch):
@@ -172,38 +174,23 @@ def test_memory_is_planned_within_a_tenth(monkeypatch):
         assert row["planned_bytes"] == pytest.approx(row["compiled_bytes"], rel=0.1)
 
 
-def test_report_of_a_run(tmp_path, config):
-    about = {"device": "some GPU", "versions": {"jax": "1", "warp-lang": "2"}, "commit": "abc", "time": "2026-01-01T00:00:00Z"}
-    call = {"kind": "call", "layout": "jitter", "points": 1000, "capacity": 100, "exact_directed_pairs": 5}
-    both = {**call, "kind": "sum", "gradient": True}
+def test_report_of_a_run(tmp_path):
+    about = {"device": "some GPU", "versions": {"jax": "1"}, "commit": "abc", "time": "2026-01-01T00:00:00Z"}
+    call = {"kind": "call", "layout": "jitter", "points": 1000, "capacity": None}
     rows = [
-        {"kind": "ceiling", "method": "read and write", "bytes_per_s": 1e12},
-        {"kind": "exactness", "method": "jfrnn warp", "dtype": "float32", "dim": 3, "cases": 2, "wrong": 0},
-        {**call, "method": "jfrnn warp", "directed_pairs": 5, "median_s": 1e-3},
-        {**call, "method": "a peer", "directed_pairs": 7, "median_s": 4e-3},
+        {"kind": "exactness", "method": "jfrnn warp", "cases": 2, "wrong": 0, "wrong_cases": []},
+        {**call, "method": "jfrnn warp", "directed_pairs": 5, "median_s": 1e-3, "seconds": [1e-3]},
         {**call, "method": "another", "reason": "not installed"},
-        {**both, "method": "pair_sum warp", "median_s": 2e-3, "error": 0.5, "compiled_bytes": 68_000},
-        {**both, "method": "list, sum", "median_s": 6e-3, "error": 0.25},
     ]
     (tmp_path / "rows.jsonl").write_text("\n".join(json.dumps(row | about) for row in rows))
-    text = report.report(tmp_path)
-
-    def table(title):
-        head, _, *lines = text.split(f"## {title}")[1].split("\n\n")[1].splitlines()
-        return [dict(zip(*([cell.strip() for cell in line.split("|")[1:-1]] for line in (head, each)))) for each in lines]
-
-    ours, peer, absent = table("Calls that")
-    assert (ours["/ floor"], peer["points"], peer["time [ms]"], peer["/ ours"]) == ("2404", "1 000", "4", "4")
-    assert (peer["directed pairs"], peer["exact directed pairs"]) == ("7", "5")
-    assert (absent["reason"], absent["time [ms]"]) == ("not installed", "\N{MIDDLE DOT}")
-    assert [(line["/ ours"], line["error"]) for line in table("Sums")] == [("1", "0.5"), ("3", "0.25")]
-    assert report.floor_seconds(rows[2], 1e12) == pytest.approx(1000 * 416 / 1e12)
-    assert (tmp_path / "roofline.png").stat().st_size > 1000
-
-
-def test_report_without_rows_says_what_to_run(tmp_path):
-    with pytest.raises(UsageError, match="run python -m experiments gpu"):
-        report.report(tmp_path)
+    result = CliRunner().invoke(app, ["report", str(tmp_path)], catch_exceptions=False)
+    assert [line.split() for line in result.stdout.splitlines()] == [
+        *(["exactness"], ["method", "cases", "wrong", "device"], ["jfrnn", "warp", "2", "0", "some", "GPU"], []),
+        *(["call"], ["method", "device", "layout", "points", "directed_pairs", "median_s", "reason"]),
+        ["jfrnn", "warp", "some", "GPU", "jitter", "1000", "5", "0.001"],
+        ["another", "some", "GPU", "jitter", "1000", "not", "installed"],
+    ]
+    assert (tmp_path / "call.csv").read_text().splitlines()[1] == "jfrnn warp,some GPU,jitter,1000,5,0.001,"
 
 
 def test_the_tree_of_boxes_is_a_row_beside(monkeypatch):

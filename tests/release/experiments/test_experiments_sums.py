@@ -97,25 +97,23 @@ def test_a_row_is_on_disk_before_the_next_one_starts(tmp_path, monkeypatch):
     assert [row.way for row in read(tmp_path).values()] == ["pair_sum warp"]
 
 
+ROW = sums.SumRow(
+    **{"key": "a", "layout": "full", "spacing": 1.0, "cutoff_ratio": 3.0, "dtype": "float32", "seed": 0, "gradient": False},
+    **{"way": "pair_sum warp", "compensated": False, "status": "ok", "points": 100, "error": 1.0, "peak_bytes": 4000},
+    **{"median_s": 6.0, "sum_s": 6.0},
+)
+
+
 def test_where_a_list_pays_off():
     assert sums_report.pays_from(10.0, 1.0, 6.0) == 3  # 10 + 2·1 = 2·6 is no gain yet
     assert sums_report.pays_from(10.0, 6.0, 6.0) == math.inf
-    row = sums.SumRow(
-        **{"key": "a", "layout": "full", "spacing": 1.0, "cutoff_ratio": 3.0, "dtype": "float32", "seed": 0, "gradient": False},
-        **{"way": "pair_sum warp", "compensated": False, "status": "ok", "points": 100, "error": 1.0, "peak_bytes": 4000},
-        **{"median_s": 6.0, "sum_s": 6.0},
-    )
-    listed = replace(row, key="b", way="list, sum", median_s=11.0, sum_s=1.0, build_s=10.0)
-    first, second = sums_report.table([row, listed])
+    listed = replace(ROW, key="b", way="list, sum", median_s=11.0, sum_s=1.0, build_s=10.0)
+    first, second = sums_report.table([ROW, listed])
     assert (first["ratio"], first["B per particle"], second["ratio"], second["pays_from"]) == (1.0, 40.0, 11 / 6, 3)
 
 
 def test_an_error_is_said_with_its_unit(tmp_path):
-    row = sums.SumRow(
-        **{"key": "a", "layout": "full", "spacing": 1.0, "cutoff_ratio": 3.0, "dtype": "float32", "seed": 0, "gradient": False},
-        **{"way": "pair_sum warp", "compensated": False, "status": "ok", "points": 100, "error": 0.19, "peak_bytes": 4000},
-        **{"median_s": 6.0, "sum_s": 6.0},
-    )
+    row = replace(ROW, error=0.19)
     assert sums.describe(row).endswith(", error 0.19 eps·√neighbors")
     assert "error [eps·√neighbors]" in sums_report.report([row], tmp_path).splitlines()[0]
     run = speed.StepRow(

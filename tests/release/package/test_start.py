@@ -106,12 +106,7 @@ def spoil(path):
     path.write_bytes(bytes(path.stat().st_size))
 
 
-DAMAGES = {
-    "cut": cut,
-    "emptied": lambda path: path.write_bytes(b""),
-    "spoiled": spoil,
-    "whole": lambda path: None,
-}
+DAMAGES = {"cut": cut, "emptied": lambda path: path.write_bytes(b""), "spoiled": spoil, "whole": lambda path: None}
 
 
 def test_damaged_files_are_compiled_anew(tmp_path):

@@ -23,6 +23,11 @@ SCENE = fluids.FluidScene(
     physics=PHYSICS,
 )
 BOX = fluids.Tank((0.0, 0.0), (1.0, 1.0))
+CORNERS, SIDES = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]), np.array([[0, 1], [1, 2], [2, 0]])
+
+
+def turning(center=(0.0, 0.0), rate=1.0):
+    return fluids.Solid(CORNERS, SIDES, fluids.Turning(center, None, rate))
 
 
 @pytest.mark.parametrize(
@@ -56,7 +61,21 @@ BOX = fluids.Tank((0.0, 0.0), (1.0, 1.0))
         ({"guided": -1.0}, "guided must be a finite number above 0, got -1.0"),
         ({"sealed": fluids.Tank((1.0, 0.0), (0.0, 1.0))}, "sealed must reach from a lower to an upper corner"),
         ({"periodic": fluids.Periodic((0.0, 0.0), (1.0, 1.0), (True,))}, "periodic.axes must say of each of 2 axes"),
+        ({"periodic": fluids.Periodic((0.0, 0.0), (1.0, 1.0, 1.0), (True, True))}, "periodic.lengths must have a number for each"),
+        (
+            {"periodic": fluids.Periodic(0.0, (1.0, 1.0), (True, True))},
+            "periodic.lower must have a number for each",
+        ),
+        ({"periodic": fluids.Periodic((0.0, 0.0), (1.0, 0.0), (True, True))}, "periodic must have .* finite lengths above 0"),
+        ({"periodic": fluids.Periodic((0.0, 0.0), (1.0, 1.0), True)}, "periodic.axes must say of each of 2 axes"),
+        ({"bounds": fluids.Tank((-np.inf, 0.0), (1.0, 1.0))}, "bounds must be finite, for they are what pictures show"),
         ({"solid": fluids.Solid(np.zeros((3, 2)), np.array([[0, 1], [1, 3]]))}, "solid.faces must be whole numbers from 0 to 2"),
+        ({"solid": fluids.Solid(CORNERS, SIDES[:0])}, "solid.faces has no face"),
+        ({"solid": fluids.Solid(CORNERS, SIDES, (0.0, 1.0))}, r"solid.turning must be a Turning or None, got tuple \(0.0, 1.0\)"),
+        ({"solid": turning(rate=np.nan)}, "solid.turning.rate must be a finite number, got nan"),
+        ({"solid": turning(rate="fast")}, "solid.turning.rate must be a number, got str 'fast'"),
+        ({"solid": turning(center=1.0)}, "solid.turning.center must have a number for each of 2 axes, got float 1.0"),
+        ({"solid": turning(center=(0.0, np.inf))}, r"solid.turning.center must be finite, got \(0.0, inf\)"),
         ({"physics": replace(PHYSICS, gravity=(0.0, 0.0, -9.81))}, "gravity has 3 components, expected 2 in 2D"),
         ({"physics": replace(PHYSICS, kernel="gauss")}, r"physics.kernel: got 'gauss'; input should be 'cubic', "),
         ({"physics": replace(PHYSICS, density=-1.0)}, r"physics.density: got -1.0; input should be greater than 0 \(above 0\)"),
@@ -81,6 +100,14 @@ def test_a_mistake_in_a_scene_is_named(change, message):
     for act in (check_scene, make_model, make_state):
         with pytest.raises(SceneError, match=message):
             act(replace(SCENE, **change))
+
+
+def test_thermal_energies_are_not_below_0():
+    about = {name: getattr(SCENE, name) for name in ("name", "positions", "velocities", "masses", "spacing", "duration", "step")}
+    gas = fluids.GasScene(**about, energies=np.arange(5.0), physics=fluids.Gas(1.4, 1.3))
+    check_scene(gas)
+    with pytest.raises(SceneError, match=r"energies must not be below 0: particle 0 has -1\.0"):
+        check_scene(replace(gas, energies=gas.energies - 1))
 
 
 def test_what_is_no_scene_is_refused():

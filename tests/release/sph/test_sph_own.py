@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import pyvista
+import trimesh
 from jax.tree_util import Partial
 from places import ROOT
 from test_sph_commands import invoke, read_table
@@ -16,6 +17,7 @@ from vtkmodules.vtkIOHDF import vtkHDFReader
 
 import jfrnn
 from jfrnn import sph
+from jfrnn.sph import toml_scenes
 from jfrnn.sph.errors import SceneError
 from jfrnn.sph.particles import mass_there
 
@@ -79,8 +81,37 @@ def test_probes_of_a_lattice():
         sph.pressure_at((0.5, 0.5))(model, s)
 
 
+@pytest.mark.parametrize(
+    ("probe", "message"),
+    [
+        (sph.flow_through((0.0, 0.0, 0.0), (1.0, 0.0), 0.1), r"point must be 2 finite numbers, got \(0.0, 0.0, 0.0\)"),
+        (sph.flow_through((0.0, 0.0), (0.0, 0.0), 0.1), r"normal and width must not be 0, got \(0.0, 0.0\) and 0.1"),
+        (sph.flow_through((0.0, 0.0), (1.0, 0.0), 0.0), "normal and width must not be 0"),
+        (sph.surface_height((0.1, 0.2), 0.1), r"place must be 1 finite numbers, got \(0.1, 0.2\)"),
+        (sph.force_on_walls((0.0, "a")), r"about must be 2 finite numbers, got \(0.0, 'a'\)"),
+    ],
+)
+def test_a_mistake_in_a_probe_is_named(probe, message):
+    with pytest.raises(SceneError, match=message):
+        probe(sph.make_model(FREE), sph.make_state(FREE))
+
+
+@pytest.mark.parametrize(
+    ("probes", "message"),
+    [
+        ([spring], "probes must be a dict of functions by name, got list"),
+        ({"a, b": spring}, "probes must be functions by names without a comma, got 'a, b'"),
+        ({"a": 1.0}, "probes must be functions by names without a comma, got 'a': 1.0"),
+    ],
+)
+def test_a_mistake_in_names_of_probes_is_named(tmp_path, probes, message):
+    with pytest.raises(SceneError, match=message):
+        sph.run(FREE, tmp_path / "out", sph.How(pictures=False), probes=probes)
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_run_goes_on_for_longer_and_writes_a_table(tmp_path):
-    short, longer = sph.How(frames=1, lines=2, pictures=False), sph.How(frames=2, lines=2, pictures=False)
+    short, longer = (sph.How(frames=frames, lines=2, pictures=False, dtype="float32") for frames in (1, 2))
     scene, probes = replace(FREE, duration=0.1), {"own": lambda model, s: {"far": s.x[1], "time": s.time}}
     sph.run(scene, tmp_path / "a", short, probes=probes)
     sph.run(replace(scene, duration=0.2), tmp_path / "a", longer, probes=probes)
@@ -90,6 +121,8 @@ def test_a_run_goes_on_for_longer_and_writes_a_table(tmp_path):
     table = read_table(tmp_path / "a" / "probes.csv")
     assert tuple(table) == ("step", "time", "own_far_0", "own_far_1", "own_time")
     np.testing.assert_allclose(table["own_time"], [0, 0.05, 0.1, 0.15, 0.2])
+    np.testing.assert_array_equal(table["time"], [0, 0.05, 0.1, 0.15, 0.2])  # what 0.05 of float32 is called, too
+    assert 'timestep="0.1"' in (tmp_path / "a" / "free.pvd").read_text()
     assert json.loads((tmp_path / "a" / "run.json").read_text())["duration"] == 0.2
     with pytest.raises(SceneError, match="holds a run with another duration, frames"):
         sph.run(replace(scene, duration=0.3), tmp_path / "a", short, probes=probes)
@@ -132,8 +165,9 @@ def test_a_scene_from_a_file(tmp_path):
     np.testing.assert_array_equal(scene.velocities[[0, 12, -1]], [[0.5, 0.0], [0.0, -1.0], [0.0, 0.0]])
     assert scene.positions[scene.wall].min() == pytest.approx(-0.25)
     assert (scene.physics.smoothing, scene.physics.gravity) == (pytest.approx(0.15), (0.0, -9.81))
-    code, out, _ = invoke("run", tmp_path / "bath.toml", "--frames", 1, "--no-pictures", "--out", tmp_path / "out")
+    code, out, told = invoke("run", tmp_path / "bath.toml", "--frames", 1, "--no-pictures", "--out", tmp_path / "out")
     assert (code, out.strip()) == (0, str(tmp_path / "out"))
+    assert told.strip().endswith(" J/m")  # in 2D, as the table has it
     head = (tmp_path / "out" / "energies.csv").read_text().splitlines()[0]
     assert head.startswith("step,time [s],kinetic [J/m],potential [J/m],momentum_x [kg/s],") and ",mass_in [kg/m]," in head
     series = (tmp_path / "out" / "bath.pvd").read_text()
@@ -185,6 +219,7 @@ def test_all_snapshots_go_into_one_file_that_paraview_reads(tmp_path, monkeypatc
         ({"frames": "few"}, "frames: got 'few'; input should be a valid integer"),
         ({"skin": -1.0}, "skin: got -1.0; input should be greater than or equal to 0.01"),
         ({"neighbors": "verlet"}, "neighbors: got 'verlet'; input should be 'auto', 'pair_sum' or 'list'"),
+        ({"pictures": "some"}, "pictures: got 'some'; input should be a valid boolean"),
     ],
 )
 def test_a_mistake_in_how_a_scene_is_run_is_named(told, message):
@@ -221,12 +256,81 @@ def test_a_mistake_in_what_is_written_is_named(tmp_path, more, message):
         ('open = ["+y"]', 'open = ["up"]', r"walls\[0\].open\[0\]: input should be '-x', "),
         ("[0.0, -9.81]", "[0.0, 0.0, -9.81]", "gravity has 3 components, expected 2 in 2D"),
         ("velocity = [0.0, -1.0]", "velocity = [0.0, 0.0]", "inflow.velocity must have 2 numbers that are not all 0"),
+        ("upper = [0.1, 0.6]", "upper = [0.1, 0.7]", "inflow must be one spacing of 0.1 m thick along y"),
+        ("duration = 0.3", "duration = 0.03", "inflow.duration: in 0.03 s not one layer enters, which takes 0.1 s"),
+        ('open = ["+y"]', 'open = ["+z"]', r"walls.open: in 2D there is no side '\+z'"),
+        ("upper = [0.4, 0.3]", "upper = [0.4, 0.3]\nunit = 0.001", "fill: name a lower and an upper corner, or a file, which may"),
+        ("upper = [0.4, 0.3]", 'upper = [0.4, 0.3]\nfile = "a.stl"', "fill: has corners and file 'a.stl', of which one says all"),
+        (
+            "upper = [0.4, 0.3]",
+            "upper = [0.9, 0.3]",
+            r"fill, inflow and walls overlap: the particle at \(0.85, 0.05\) m is within 0.4",
+        ),
+        ("[[fill]]", "[bounds]\nlower = [-inf, 0.0]\nupper = [1.0, 1.0]\n[[fill]]", "bounds must be finite"),
+        (
+            "[[fill]]",
+            '[periodic]\nlower = [0.0, 0.0]\nupper = [1.0, 1.0]\naxes = "xz"\n[[fill]]',
+            "periodic.axes must name axes of",
+        ),
     ],
 )
 def test_a_mistake_in_a_file_is_named(tmp_path, old, new, message):
     (tmp_path / "bath.toml").write_text(BATH.replace(old, new))
     with pytest.raises(SceneError, match=rf"bath\.toml: {message}"):
         sph.read_scene(tmp_path / "bath.toml")
+
+
+@pytest.mark.parametrize("what", ["fill", "inflow"])
+def test_a_file_that_asks_for_too_many_particles_is_refused(tmp_path, monkeypatch, what):
+    few = BATH.replace("upper = [0.4, 0.3]", "upper = [0.1, 0.1]").replace("duration = 0.3", "duration = 1.2")
+    (tmp_path / "bath.toml").write_text(BATH if what == "fill" else few)
+    monkeypatch.setattr(toml_scenes, "_MOST", 10)
+    with pytest.raises(SceneError, match=f"{what}: asks for 12 particles, expected up to 1e.01: take a larger spacing"):
+        sph.read_scene(tmp_path / "bath.toml")
+
+
+BLOCK = """
+spacing = 0.1
+duration = 0.01
+
+[physics]
+density = 1000.0
+sound_speed = 10.0
+
+[[fill]]
+lower = [0.0, 0.0, 0.0]
+upper = [0.4, 0.4, 0.3]
+"""
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        ('[[fill]]\nfile = "open.stl"', "fill: open.stl must be a closed mesh"),
+        (
+            '[[fill]]\nfile = "cube.stl"\nunit = 0.001',
+            "fill: in cube.stl there is no room for particles 0.1 m apart",
+        ),
+        ('[solid]\nfile = "cube.stl"\nunit = 0.001', "solid .*cube.stl: is 0.0004 m long, .*; name the unit of the file"),
+        ('[solid]\nfile = "cube.stl"\naxis = [0.0, 0.0, 1.0]', "solid: has a center or an axis, and no rate"),
+        ('[solid]\nfile = "cube.stl"\nrate = 1.0', "solid.turning.axis must have a number for each of 3 axes, got NoneType None"),
+    ],
+)
+def test_a_mistake_in_a_mesh_of_a_file_is_named(tmp_path, more, message):
+    cube = trimesh.creation.box((0.4, 0.4, 0.4))
+    cube.export(tmp_path / "cube.stl")
+    trimesh.Trimesh(cube.vertices, cube.faces[1:]).export(tmp_path / "open.stl")
+    (tmp_path / "block.toml").write_text(BLOCK + more)
+    with pytest.raises(SceneError, match=rf"block\.toml: {message}"):
+        sph.read_scene(tmp_path / "block.toml")
+
+
+def test_layers_that_enter_aslant_are_a_spacing_apart(tmp_path):
+    """So that what enters has the density of the fluid, too."""
+    (tmp_path / "bath.toml").write_text(BATH.replace("velocity = [0.0, -1.0]", "velocity = [1.0, -1.0]"))
+    scene = sph.read_scene(tmp_path / "bath.toml")
+    np.testing.assert_allclose(scene.enters[12:15], [0.0, 0.1, 0.2], atol=1e-12)  # of which each has gone on by 0.1 m along y
+    assert scene.guided == pytest.approx(0.3)
 
 
 def test_the_file_of_the_page_is_a_scene(tmp_path):

@@ -13,6 +13,7 @@ from experiments.sph import answers, scenes
 from jfrnn.cases import fluids, meshes
 from jfrnn.sph import budget, force_on_solid, health, solids, solver, view
 from jfrnn.sph.errors import SceneError
+from jfrnn.sph.inside import find_inside
 from jfrnn.sph.kernels import KERNELS
 from jfrnn.sph.model import make_model, make_state
 
@@ -93,6 +94,26 @@ def test_frames_turn_back(dim):
     moved = view.turn_vertices(x, turning, 0.7)
     assert np.ptp(np.linalg.norm(moved - x, axis=1)) > 0.1
     np.testing.assert_allclose(solids.into_frame(jnp.asarray(moved), there, 0.7 * 3.0), x, atol=1e-14)
+
+
+def test_a_wall_drags_by_the_dynamic_viscosity_of_the_source():
+    """μ = ρν of "source" and ν of "morris" are the same fluid, and do the same to a wall that turns."""
+    square = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+    sides = np.stack([np.arange(4), (np.arange(4) + 1) % 4], axis=1)
+    solid = fluids.Solid(square, sides, fluids.Turning((0.0, 0.0), None, 2.0))
+    x, rho, found = np.array([[1.07, 0.2], [0.3, 1.1]]), jnp.asarray([800.0, 1100.0]), []
+    for form, viscosity in (("morris", 1.0), ("source", 1000.0)):
+        scene = beside(solid, x, velocities=0.3 * x, density=1000.0, viscosity=viscosity, viscosity_form=form)
+        model, s = make_model(scene), make_state(scene)
+        onto, _ = solids.load(model, s, s.solid, rho, 0 * rho)
+        found.append(np.asarray(onto) * (1 if form == "morris" else np.asarray(rho)[:, None] / 1000.0))
+        step = float(solver.courant(model, s._replace(v=0 * s.v, solid=None)))
+        assert step == pytest.approx(0.125 * 0.15**2 / 1.0)
+    np.testing.assert_allclose(*found, rtol=1e-6)
+    assert np.abs(found[0]).max() > 1.0
+    ball = beside(None, np.zeros((1, 3)), viscosity=1.0, viscosity_form="source")
+    with pytest.raises(SceneError, match="pressure and viscosity_form 'source' are forms in 2D"):
+        make_model(ball)
 
 
 SHARP = meshes.gear(6, 200, 1.0, 2.0, 3.0)
@@ -247,6 +268,9 @@ def test_fluid_in_the_solid_and_open_meshes_are_refused():
     scene = drop_on_gear(2)
     with pytest.raises(ValueError, match=r"positions of the fluid must be outside the solid by 0.1 spacings: particle 0 is not"):
         make_state(replace(scene, positions=scene.positions - [0, 1.8]))
+    large = replace(scene.solid, vertices=20 * scene.solid.vertices)  # so that the drop is deep in it, and sees no face
+    with pytest.raises(SceneError, match=r"particle 0 is not. If it seems to be, the faces of the solid are inside out"):
+        make_state(replace(scene, solid=large))
     with pytest.raises(ValueError, match="solid must be a closed mesh"):
         make_state(replace(scene, solid=replace(scene.solid, faces=scene.solid.faces[1:])))
 
@@ -256,6 +280,28 @@ def test_fluid_in_a_finely_meshed_solid_is_refused_alike():
     scene = beside(fluids.Solid(*meshes.sphere(0.28, 12)), np.zeros((1, 3)), 0.1)
     with pytest.raises(SceneError, match=r"positions of the fluid must be outside the solid by 0.1 spacings: particle 0 is not"):
         make_state(scene)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("around", [False, True])
+def test_which_points_are_far_inside(dim, around):
+    """A ring of two circles, or a ball with a hole like a cube; with faces turned around, the fluid is where the solid was."""
+    if dim == 3:
+        (ball, faces), (hole, sides) = meshes.sphere(1.0, 24), meshes.cube(0.6, 4)
+        vertices, faces = np.concatenate([ball, hole]), np.concatenate([faces, sides[:, ::-1] + len(ball)])
+    else:
+        angle = np.linspace(0, 2 * np.pi, 90, endpoint=False)
+        circle, next_one = np.stack([np.cos(angle), np.sin(angle)], axis=1), np.roll(np.arange(90), -1)
+        vertices = np.concatenate([circle, 0.4 * circle])
+        faces = np.concatenate([np.stack([np.arange(90), next_one], axis=1), 90 + np.stack([next_one, np.arange(90)], axis=1)])
+    x = np.random.default_rng(0).uniform(-1.5, 1.5, (800, dim))
+    size = np.max(np.abs(x), axis=1) / 0.3 if dim == 3 else np.linalg.norm(x, axis=1) / 0.4
+    radius, reach = np.linalg.norm(x, axis=1), 0.05
+    far = (np.abs(radius - 1) > 0.1) & (np.abs(size - 1) > 0.3)
+    expected = (radius < 1) & (size > 1)
+    found = find_inside(x[far], reach, vertices[faces[:, ::-1] if around else faces])
+    np.testing.assert_array_equal(found, expected[far] != around)
+    assert 20 < expected[far].sum() < far.sum() - 20
 
 
 @pytest.mark.parametrize("integrator", ["symplectic", "midpoint"])

@@ -1,0 +1,101 @@
+"""What benches of lists share: ways that are right are timed, and nothing wrong is."""
+
+import jax
+import numpy as np
+import pandas as pd
+import pytest
+from typer.testing import CliRunner
+
+from experiments import methods
+from experiments._cli import app
+from experiments.bench import arrays, crystals, latency, lists, table
+
+N = 16
+SUMS = ("list", "counts", "density", "density, gradient")
+WAYS = {  # of each bench: its options, who does what, and times
+    "latency": (
+        ("--sizes", str(N)),
+        ("x + 1", *SUMS, "dense list", "sparse list", "cells", "all pairs"),
+        ("waited_us", "step_us", "waited_ratio", "step_ratio"),
+    ),
+    "crystals": (("--sizes", "3x12"), ("counts", "list", "list", "list"), ("waited_ms",)),
+    "arrays": (
+        ("--sides", "6"),
+        ("list", *SUMS, "list in a box", "x + 1", "list", "list", "counts"),
+        ("lower_s", "compile_s", "waited_ms", "step_ms"),
+    ),
+}
+
+
+@pytest.mark.parametrize("bench", ["latency", "crystals", pytest.param("arrays", marks=pytest.mark.slow)])
+@pytest.mark.filterwarnings("ignore")  # of other libraries
+def test_every_way_gets_a_row_and_none_twice(tmp_path, foreign, bench):
+    options, whats, times = WAYS[bench]
+    words = ["bench", bench, *options, "--repeats", "2", "--out", str(tmp_path)]
+    result = CliRunner().invoke(app, words)
+    assert result.exit_code == 0, result.output
+    rows = (tmp_path / "rows.jsonl").read_bytes()
+    assert CliRunner().invoke(app, words).stdout == result.stdout
+    assert (tmp_path / "rows.jsonl").read_bytes() == rows
+    found = pd.read_csv(tmp_path / "cpu.csv")
+    assert tuple(found["what"]) == whats
+    for _, row in found.iterrows():
+        missing = None if row["who"] in ("jfrnn", "jax", "XLA") else methods.lacks(row["who"])
+        assert row["status"] == ("ok" if missing is None else "missing")
+        assert (row[[*times]] > 0).all() and row["wrong"] == 0 if missing is None else row["reason"] == missing
+    if bench == "latency":
+        assert (found.loc[found["what"] == "x + 1", ["waited_ratio", "step_ratio"]] == 1).all(axis=None)
+    if bench == "arrays":
+        assert list(found["layout"]) == ["jitter"] * 8 + ["ties"] * 2
+
+
+def test_a_size_is_systems_and_atoms():
+    result = CliRunner().invoke(app, ["bench", "crystals", "--sizes", "3"])
+    assert result.exit_code == 2
+    assert "say systems x atoms of each" in result.output
+    assert crystals._read_size("256x100") == (256, 100)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return latency._make_scene(N)
+
+
+def test_of_a_wrong_answer_no_time_is_taken(scene):
+    nearer = scene._replace(cutoff=0.8 * scene.cutoff)
+    for way in latency._ways():
+        if way.who == "jfrnn":
+            row = {}
+            wrong = way._replace(make=lambda scene, way=way: way.make(nearer))
+            assert table.judge(row, wrong, scene, lambda function: lambda: jax.jit(function)(scene.x)) is None
+            assert (row["status"], row["wrong"] > 0) == ("failed", True), way.what
+            assert row["reason"] == f"the answer is wrong for {row['wrong']} particles"
+
+
+def test_an_error_is_a_row(scene):
+    def make(scene):
+        raise RuntimeError("no such thing")
+
+    row = {}
+    assert table.judge(row, next(latency._ways())._replace(make=make), scene, None) is None
+    assert row == {"who": "jax", "what": "x + 1", "status": "failed", "reason": "RuntimeError: no such thing"}
+
+
+def test_a_wrong_list_is_seen():
+    scene = arrays._make_scene(5, "ties")
+    distances = np.linalg.norm(np.asarray(scene.x)[:, None] - np.asarray(scene.x), axis=2)
+    rows = [[j for j in np.flatnonzero(row < 3) if j != i] for i, row in enumerate(distances)]
+    n, width = len(rows), max(map(len, rows))
+    idx = np.array([row + [n] * (width - len(row)) for row in rows])
+    assert lists.wrong_rows(scene, (idx, scene.counts)) == 0
+    assert lists.wrong_rows(scene, (idx[:, ::-1], scene.counts)) == 0
+    assert lists.wrong_rows(scene, (idx, scene.counts + (np.arange(n) < 2))) == 2
+    pairs = np.array([(i, j) for i, row in enumerate(rows) for j in row]).T
+    padded = np.pad(pairs, ((0, 0), (0, 3)), constant_values=n)
+    assert lists.wrong_counts_of_pairs(scene, padded) == 0
+    assert lists.wrong_counts_of_pairs(scene, padded[:, 1:]) == 1
+    idx[3, 0], idx[7, 1] = 3, idx[7, 0]
+    assert lists.wrong_rows(scene, (idx, None)) == 2
+    tied = idx.copy()
+    tied[9, 0] = np.flatnonzero(distances[9] == 3)[0]
+    assert lists.wrong_rows(scene, (tied, None)) == 3
