@@ -82,7 +82,7 @@ lint: style
 style: $(STAMP)
 	$(VENV)/bin/ruff check .
 	$(VENV)/bin/ruff format --check .
-	$(VENV)/bin/clang-format --dry-run -Werror kernels/native/*
+	$(VENV)/bin/clang-format --dry-run -Werror kernels/native/*/*
 
 clean:
 	rm -rf $(VENV) .cache out build docs/api/objects docs/notebooks docs/pictures *.egg-info

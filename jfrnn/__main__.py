@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jfrnn
-from jfrnn._engine import ENGINES, Engine, Kind, compiler, default_platform, fastest_engine
+from jfrnn._engine import ENGINES, Engine, Features, compiler, default_platform, fastest_engine
 from jfrnn._tracing import Given
 
 _N, _UNITS, _CUTOFF = 400, 40, 8  # particles, edge of their box and cutoff, in eighths: all squares are exact
@@ -65,7 +65,7 @@ def _check(engine: Engine, missing: str | None) -> bool | None:
     if missing is not None:
         print(f"  {engine.name:9} does not run: {missing}")
         return None
-    start, sums = time.perf_counter(), engine.refuse(Kind(summed=True)) is None
+    start, sums = time.perf_counter(), engine.refuse(Features(summed=True)) is None
     try:
         right = _is_right(engine.name, sums)
     except Exception as error:  # whatever breaks on this machine, the other engines are tried as well

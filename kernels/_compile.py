@@ -38,7 +38,7 @@ _loaded: weakref.WeakValueDictionary[tuple[Program, str], "Library"] = weakref.W
 
 
 class Library:
-    """A program that is loaded on a device; it is unloaded when nobody has it any longer."""
+    """A program that is loaded on a device; it is unloaded when nothing refers to it any longer."""
 
     def __init__(self, program: Program, device: str, start: Start) -> None:
         self._program, self._start = program, start

@@ -1,13 +1,14 @@
 """The native sources in `kernels/native`: C++ (`*.h`) for the CPU and for all devices, CUDA (`*.cuh`).
 
-A source is a header that includes those it needs. `resolve` puts them together: no compiler looks for files, and the text of a
-kernel tells all of what it is.
+A source is a header that includes those it needs, by their names, whatever folder of `native` they stand in. `resolve` puts them
+together: no compiler looks for files, and the text of a kernel tells all of what it is.
 """
 
 import functools
 import re
 from collections.abc import Mapping
 from importlib.resources import files
+from importlib.resources.abc import Traversable
 from types import MappingProxyType
 
 _INCLUDE = re.compile(r'^#include "(.+)"\n', re.MULTILINE)
@@ -38,4 +39,11 @@ def resolve(*headers: str, given: Mapping[str, str] = MappingProxyType({"constan
 
 @functools.cache
 def _read(file: str) -> str:
-    return (files("jfrnn.kernels") / "native" / file).read_text("utf-8")
+    return native_files()[file].read_text("utf-8")
+
+
+@functools.cache
+def native_files() -> dict[str, Traversable]:
+    """Return the files in all folders of `kernels/native`, by their names."""
+    folders = [folder for folder in (files("jfrnn.kernels") / "native").iterdir() if folder.is_dir()]
+    return {file.name: file for folder in folders for file in folder.iterdir()}

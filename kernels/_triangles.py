@@ -18,7 +18,7 @@ _LIMBS = {False: 14, True: 90}  # of a coordinate of either width
 
 
 def constants(dim: int, double: bool, stride: int) -> dict[str, int]:
-    """Return the constants of `native/triangle_exact.h`: ROOM is the memory of a pair in ints; threads have every `stride`-th."""
+    """Return the constants of `triangle_exact.h`: ROOM is the memory of a pair in ints; threads have every `stride`-th."""
     limbs = _LIMBS[double]
     room = sum((two, three)[dim == 3] * (2 + limbs * degree) for two, three, degree in _NUMBERS.values())
     return {"LIMBS": limbs, "ROOM": room, "STRIDE": stride}

@@ -4,5 +4,5 @@ import os
 import threading
 
 one_at_a_time = threading.RLock()
-if hasattr(os, "register_at_fork"):  # what another thread holds while a process forks, nobody gives back in the new one
+if hasattr(os, "register_at_fork"):  # a lock that another thread holds while a process forks would stay taken in the new one
     os.register_at_fork(before=one_at_a_time.acquire, after_in_parent=one_at_a_time.release, after_in_child=one_at_a_time.release)

@@ -6,8 +6,9 @@ On the CPU the kernels of cells and sums serve them (`jfrnn.kernels.cells_cpu`),
 import functools
 from typing import NamedTuple
 
-from jfrnn.kernels._native import RULES, SPACES, program
-from jfrnn.kernels._program import Entry, Kernel, declare
+from jfrnn.kernels._kind import Kind
+from jfrnn.kernels._native import declare_kind
+from jfrnn.kernels._program import Entry, Kernel
 from jfrnn.kernels.cells_cuda import GRID
 from jfrnn.kernels.pair_sum_cpu import TermText, constants_of, term_header
 
@@ -15,8 +16,6 @@ PADDING = 16  # sources behind the last one that may be read
 LANES = 16  # of CUDA that serve a query
 _BLOCK = 128
 BLOCKS = 8  # that share a multiprocessor: what decides exactly may spill registers, it is rare
-
-
 _LAID_AT_ONCE = 1024  # systems whose cells are laid out at once
 _HEADER = 16  # words
 
@@ -46,72 +45,36 @@ class Sorting(NamedTuple):
         return list(each.items())
 
 
-@functools.lru_cache(16)
-def sorting_kernels(dim: int, double: bool, periodic: int) -> Sorting:
-    """Return the kernels that sort sources on CUDA; `periodic` is that of `jfrnn.kernels._native.program`."""
-    entries = [Entry(f"BoxSort.{name}", _LAID_AT_ONCE if name == "lay_out" else GRID["BLOCK"]) for name in _STAGES]
-    text = program(double, dim, "box_sort.cuh", given={}, PERIODIC=periodic, **GRID)
-    name = f"box_sort_{dim}d_{'f64' if double else 'f32'}{SPACES[periodic]}"
-    return Sorting(*declare(name, text, *entries, cuda=True, fused=True))
-
-
 _STAGES = ("count_members", "lay_out", "count_cells", "scan_counts", "scatter", "rank")
 
 
+@functools.lru_cache(16)
+def sorting_kernels(kind: Kind) -> Sorting:
+    """Return the kernels that sort sources on CUDA."""
+    entries = [Entry(f"BoxSort.{name}", _LAID_AT_ONCE if name == "lay_out" else GRID["BLOCK"]) for name in _STAGES]
+    return Sorting(*declare_kind(kind.only("periodic"), "box_sort", "box_sort.cuh", *entries, cuda=True, constants=GRID))
+
+
 @functools.lru_cache(64)
-def rows_kernel(
-    dim: int,
-    double: bool,
-    scaled: bool,
-    lists: bool,
-    later: bool,
-    periodic: int,
-    excluding: int = 0,
-    flat: bool = False,
-    rule: str = "",
-) -> Kernel:
-    """Return the kernel for a dimension and dtype, for cutoffs that need scaling or not, for lists or counts, half lists or whole.
-
-    `periodic`, `excluding` and `flat` are those of `jfrnn.kernels._native.program`; `rule` is one of its `RULES`, "" with one
-    cutoff.
-    """
-    kind = f"{dim}d_{'f64' if double else 'f32'}{'_scaled' * scaled}{'_list' * lists}{'_flat' * flat}{'_later' * later}"
-    name = f"box_rows_cuda_{kind}{SPACES[periodic]}{'_excluding' * excluding}{f'_{rule}' * bool(rule)}"
-    constants = _constants(periodic, scaled, lists, later, rule) | {"EXCLUDING": excluding, "FLAT": flat}
-    text = program(double, dim, "box_rows.cuh", given={}, SUMS=0, **constants)
-    return declare(name, text, Entry("BoxRows.run", _BLOCK, BLOCKS), cuda=True, fused=True)[0]
+def rows_kernel(kind: Kind) -> Kernel:
+    """Return the kernel that lists or counts."""
+    constants, entry = {"SUMS": 0, **_constants(kind)}, Entry("BoxRows.run", _BLOCK, BLOCKS)
+    return declare_kind(kind.compiled("batched"), "box_rows_cuda", "box_rows.cuh", entry, cuda=True, constants=constants)[0]
 
 
-def _constants(periodic: int, scaled: bool, lists: bool, later: bool, rule: str) -> dict[str, int]:
-    found = {"PERIODIC": periodic, "SCALED": scaled, "LIST": lists, "LATER": later, "SUM": rule == "mean"}
-    found |= {"RULE": RULES.index(rule)} if rule else {}
-    return found | {"LANES_PER_ROW": LANES}
+def _constants(kind: Kind) -> dict[str, int]:
+    return {"LIST": kind.lists, "LATER": kind.later, "LANES_PER_ROW": LANES}
 
 
 @functools.lru_cache(512)
-def sum_kernel(
-    term: TermText,
-    key: str,
-    dim: int,
-    double: bool,
-    scaled: bool,
-    compensated: bool,
-    extremes: bool,
-    periodic: int,
-    excluding: int = 0,
-    rule: str = "",
-) -> Kernel:
+def sum_kernel(kind: Kind, term: TermText, key: str) -> Kernel:
     """Return the kernel that sums a term; `key` tells it from all others in the names of programs.
 
-    `extremes`: it finds the largest summands instead, as `jfrnn.kernels.pair_sum_cpu.query_kernel` does.
+    For extremes, it finds the largest summands as `jfrnn.kernels.pair_sum_cpu.query_kernel` does.
     """
-    name = f"box_sums_cuda_{dim}d_{'f64' if double else 'f32'}{'_scaled' * scaled}"
-    name += f"{'_compensated' * compensated}{SPACES[periodic]}{'_extremes' * extremes}{'_excluding' * excluding}"
-    name += f"{f'_{rule}' * bool(rule)}_{key}"
-    constants = {**GRID, **_constants(periodic, scaled, False, False, rule), **constants_of(term, compensated, extremes)}
-    constants["EXCLUDING"] = excluding
-    text = program(double, dim, "box_sums.cuh", given=term_header(term, double), **constants)
-    return declare(name, text, Entry("BoxSums.run", _BLOCK, BLOCKS), cuda=True, fused=True)[0]
+    constants, given = {**GRID, **_constants(kind), **constants_of(term, kind)}, term_header(term, kind.double)
+    name, entry = f"box_sums_cuda_{key}", Entry("BoxSums.run", _BLOCK, BLOCKS)
+    return declare_kind(kind.compiled("batched"), name, "box_sums.cuh", entry, cuda=True, given=given, constants=constants)[0]
 
 
 def slots(queries: int) -> int:

@@ -17,8 +17,9 @@ crossing the same in a periodic box, for queries whose reach leaves it: images t
 import functools
 from typing import NamedTuple
 
-from jfrnn.kernels._native import RULES, SPACES, place_parts, program, table_cells
-from jfrnn.kernels._program import Entry, Kernel, declare
+from jfrnn.kernels._kind import Kind
+from jfrnn.kernels._native import declare_kind, place_parts, table_cells
+from jfrnn.kernels._program import Entry, Kernel
 
 BLOCK = 256
 QUERY_BLOCK = 32  # one warp: others need not wait for it to end
@@ -143,56 +144,25 @@ def walks(query: Kernel, crossing: Kernel | None, m: int, multiprocessors: int) 
     return [first, Launch(query, threads, False, beside=True)]
 
 
-def constants_of(rule: str) -> dict[str, int]:
-    """Return the constants of kernels for cutoffs that differ by a rule of `RULES`."""
-    return {"RULE": RULES.index(rule), "SUM": rule == "mean", "SCALED": True}
-
-
-def walking_blocks(lists: bool, double: bool) -> int:
+def walking_blocks(kind: Kind) -> int:
     """Return how many blocks that list or count share a multiprocessor: registers against occupancy, as cells on an H200 want."""
-    return 24 if not lists else 16 if double else 20
+    return 24 if not kind.lists else 16 if kind.double else 20
 
 
 @functools.lru_cache(512)
-def cell_kernels(
-    dim: int,
-    double: bool,
-    scaled: bool,
-    lists: bool,
-    later: bool = False,
-    reach: int = GRID["REACH"],
-    reach_x: int = GRID["REACH_X"],
-    periodic: int = 0,
-    batched: bool = False,
-    excluding: int = 0,
-    flat: bool = False,
-    rule: str = "",
-) -> Kernels:
-    """Return the kernels for a dimension and dtype, for cutoffs that need scaling or not, for lists or counts, half lists or whole.
-
-    `periodic`, `batched`, `excluding` and `flat` are those of `jfrnn.kernels._native.program`. `reach` is the number of cell edges
-    in a cutoff along y and z, `reach_x` along x; other numbers than these are slower, and only measurements ask for them.
-    `rule`: one of `RULES`, where cutoffs differ.
-    """
-    blocks = walking_blocks(lists, double)
-    kind = f"{dim}d_{'f64' if double else 'f32'}_r{reach}x{reach_x}"
-    kind += SPACES[periodic] + "_batched" * batched
-    variant = f"{kind}{'_scaled' * scaled}{'_list' * lists}{'_flat' * flat}{'_later' * later}{'_excluding' * excluding}"
-    variant += "_" * bool(rule) + rule
-    grid = {**GRID, "REACH": reach, "REACH_X": reach_x, "PERIODIC": periodic, "BATCHED": batched}
-    query = {"SCALED": scaled, "LIST": lists, "FLAT": flat, "SUMS": 0, "LATER": later, "EXCLUDING": excluding}
-    query |= grid | (constants_of(rule) if rule else {})
+def cell_kernels(kind: Kind) -> Kernels:
+    """Return the kernels that sort by cell, and that list or count."""
+    compiled, constants = kind.compiled(), {"LIST": kind.lists, "SUMS": 0, "LATER": kind.later, **GRID}
 
     def query_kernel(name: str, crossing: bool = False) -> Kernel:
-        kind = {"CROSSING": crossing, "SHIFTED": periodic if crossing else 0}
-        text = program(double, dim, "rows.cuh", **query | kind)
-        entry = Entry("Rows.run", QUERY_BLOCK, blocks, "Rows_cross" * crossing)
-        return declare(f"{name}_cuda_{variant}", text, entry, cuda=True, fused=True)[0]
+        where = {"CROSSING": crossing, "SHIFTED": kind.periodic if crossing else 0}
+        entry = Entry("Rows.run", QUERY_BLOCK, walking_blocks(kind), "Rows_cross" * crossing)
+        return declare_kind(compiled, f"{name}_cuda", "rows.cuh", entry, cuda=True, constants=constants | where)[0]
 
     methods = ("find_bounds", "lay_out_grid", "count_cells", "scan_counts", "scatter_ids", "gather_places")
     stages = [Entry(f"Search.{method}", BLOCK) for method in methods]
-    stages[-1] = stages[-1]._replace(blocks=_GATHERING[periodic > 0])
-    sorting = declare(f"cells_cuda_{kind}", program(double, dim, "cells.cuh", **grid), *stages, cuda=True, fused=True)
+    stages[-1] = stages[-1]._replace(blocks=_GATHERING[kind.periodic > 0])
+    sorting = declare_kind(kind.only("periodic", "batched"), "cells_cuda", "cells.cuh", *stages, cuda=True, constants=GRID)
     bounds, lay_out, count, scan, scatter, gather = sorting
-    crossing = query_kernel("crossing", crossing=True) if periodic else None
+    crossing = query_kernel("crossing", crossing=True) if kind.periodic else None
     return Kernels(bounds, lay_out, count, scan, scatter, gather, query_kernel("query"), crossing)

@@ -6,8 +6,9 @@ a box that stands along the axes, and in which no pair has two images, the neare
 
 import functools
 
-from jfrnn.kernels._native import program
-from jfrnn.kernels._program import Entry, Kernel, declare
+from jfrnn.kernels._kind import Kind
+from jfrnn.kernels._native import declare_kind
+from jfrnn.kernels._program import Entry, Kernel
 from jfrnn.kernels.cells_cuda import GRID
 from jfrnn.kernels.pair_sum_cpu import TermText, constants_of, term_header
 
@@ -43,49 +44,19 @@ def slots(queries: int) -> int:
 
 
 @functools.lru_cache(64)
-def rows_kernel(
-    warps: int,
-    dim: int,
-    double: bool,
-    lists: bool,
-    batched: bool,
-    boxed: bool = False,
-    excluding: int = 0,
-    flat: bool = False,
-) -> Kernel:
-    """Return the kernel for warps of a block, a dimension and a dtype, for lists or counts alone."""
-    variant = f"{warps}w_{dim}d_{'f64' if double else 'f32'}{'_list' * lists}{'_nearest' * boxed}{'_batched' * batched}"
-    variant += "_excluding" * excluding + "_flat" * flat
-    options = {"EXCLUDING": excluding, "FLAT": flat, **_constants(warps, lists, batched, boxed)}
-    text = program(double, dim, "few_rows.cuh", SUMS=0, **options)
-    return declare(f"few_cuda_{variant}", text, Entry("FewRows.run", 32 * warps), cuda=True, fused=True)[0]
+def rows_kernel(kind: Kind, warps: int) -> Kernel:
+    """Return the kernel that lists or counts, for warps of a block."""
+    constants, entry = {"SUMS": 0, "LIST": kind.lists, **_sizes(warps)}, Entry("FewRows.run", 32 * warps)
+    return declare_kind(kind.compiled("later"), f"few_cuda_{warps}w", "few_rows.cuh", entry, cuda=True, constants=constants)[0]
 
 
 @functools.lru_cache(512)
-def sum_kernel(
-    warps: int,
-    term: TermText,
-    key: str,
-    dim: int,
-    double: bool,
-    compensated: bool,
-    batched: bool = False,
-    extremes: bool = False,
-    boxed: bool = False,
-    excluding: int = 0,
-) -> Kernel:
-    """Return the kernel that sums a term.
-
-    But for the warps of a block, the arguments are those of `jfrnn.kernels.pair_sum_cuda.sum_kernels`.
-    """
-    variant = f"{warps}w_{dim}d_{'f64' if double else 'f32'}{'_compensated' * compensated}{'_nearest' * boxed}"
-    variant += f"{'_batched' * batched}{'_extremes' * extremes}{'_excluding' * excluding}"
-    constants = (
-        GRID | {"EXCLUDING": excluding} | _constants(warps, False, batched, boxed) | constants_of(term, compensated, extremes)
-    )
-    text = program(double, dim, "few_sums.cuh", given=term_header(term, double), **constants)
-    return declare(f"few_sums_cuda_{variant}_{key}", text, Entry("FewSums.run", 32 * warps), cuda=True, fused=True)[0]
+def sum_kernel(kind: Kind, warps: int, term: TermText, key: str) -> Kernel:
+    """Return the kernel that sums a term, for warps of a block, as `jfrnn.kernels.pair_sum_cuda.sum_kernels` does."""
+    constants, given = {**GRID, "LIST": 0, **_sizes(warps), **constants_of(term, kind)}, term_header(term, kind.double)
+    name, entry = f"few_sums_cuda_{key}_{warps}w", Entry("FewSums.run", 32 * warps)
+    return declare_kind(kind.compiled(), name, "few_sums.cuh", entry, cuda=True, given=given, constants=constants)[0]
 
 
-def _constants(warps: int, lists: bool, batched: bool, boxed: bool) -> dict[str, int]:
-    return {"LIST": lists, "PERIODIC": boxed, "BATCHED": batched, "FEW_MOST": MOST, "FEW_WARPS": warps}
+def _sizes(warps: int) -> dict[str, int]:
+    return {"FEW_MOST": MOST, "FEW_WARPS": warps}

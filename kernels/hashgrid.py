@@ -19,8 +19,9 @@ import struct
 from typing import NamedTuple
 
 from jfrnn.kernels._clang import warp_root
-from jfrnn.kernels._native import program
-from jfrnn.kernels._program import Entry, Kernel, declare
+from jfrnn.kernels._kind import Kind
+from jfrnn.kernels._native import declare_kind
+from jfrnn.kernels._program import Entry, Kernel
 
 BLOCK = 128
 _RESIDENT = 6  # blocks of queries in float32 on a multiprocessor: 79 registers a thread, not 88
@@ -57,20 +58,20 @@ def split_width(width: float) -> dict[str, int]:
 
 
 @functools.cache
-def search_kernels(dim: int, double: bool, scaled: bool, lists: bool, cuda: bool, flat: bool = False) -> Kernels:
-    """Return the kernels for a dimension and dtype, for cutoffs that need scaling or not, for lists or counts alone."""
-    variant = f"{'cuda' if cuda else 'cpu'}_{dim}d_{'f64' if double else 'f32'}{'_scaled' * scaled}{'_list' * lists}"
-    variant += "_flat" * flat
-    text = program(double, dim, "hashgrid.h", given={"warp_hashgrid.h": warp_header()}, SCALED=scaled, LIST=lists, FLAT=flat)
-    entries = Entry("HashGridSearch.pack", BLOCK), Entry("HashGridSearch.query", BLOCK, 1 if double else _RESIDENT)
-    return Kernels(*declare(f"hashgrid_{variant}", text, *entries, cuda=cuda, fused=cuda))
+def search_kernels(kind: Kind, cuda: bool) -> Kernels:
+    """Return the kernels that list or count."""
+    name, given = f"hashgrid_{'cuda' if cuda else 'cpu'}", {"warp_hashgrid.h": warp_header()}
+    entries = Entry("HashGridSearch.pack", BLOCK), Entry("HashGridSearch.query", BLOCK, 1 if kind.double else _RESIDENT)
+    return Kernels(
+        *declare_kind(kind.compiled("later"), name, "hashgrid.h", *entries, cuda=cuda, given=given, constants={"LIST": kind.lists})
+    )
 
 
 @functools.cache
 def build_kernel(double: bool) -> Kernel:
     """Return what builds a grid of a dtype, on the CPU or on CUDA: it runs on the host."""
-    text = program(double, 3, "hashgrid_build.h", given={"warp_hashgrid.h": warp_header()})
-    return declare(f"hashgrid_build_{'f64' if double else 'f32'}", text, "HashGridBuild.build")[0]
+    given = {"warp_hashgrid.h": warp_header()}
+    return declare_kind(Kind(3, double), "hashgrid_build", "hashgrid_build.h", "HashGridBuild.build", given=given)[0]
 
 
 @functools.cache

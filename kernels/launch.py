@@ -1,4 +1,4 @@
-"""The program that stands between XLA and all kernels (`native/launch.h`), which Clang compiles like those for the CPU."""
+"""The program that stands between XLA and all kernels (`native/launch/launch.h`), which Clang compiles like those for the CPU."""
 
 import re
 

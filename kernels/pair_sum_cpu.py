@@ -14,8 +14,9 @@ import re
 from typing import NamedTuple
 
 from jfrnn.kernels import tree_cpu
-from jfrnn.kernels._native import BATCHES, SPACES, program
-from jfrnn.kernels._program import Kernel, declare
+from jfrnn.kernels._kind import Kind
+from jfrnn.kernels._native import declare_kind
+from jfrnn.kernels._program import Kernel
 from jfrnn.kernels.cells_cpu import CHUNK, GRID, QUERY_CHUNK, TOGETHER
 
 CACHE_BYTES = 40 << 10  # for candidates: most of a first-level cache, and a little of the second
@@ -99,7 +100,7 @@ class TermText(NamedTuple):
 
     @property
     def reads_rows(self) -> int:
-        """Of j, whether it reads what rows of particles in a box hold, positions and turns: 1, or 2 where any turn is not -1, 0, 1.
+        """Whether it reads of j what rows of particles in a box hold, positions and turns: 1, or 2 where any turn is not -1, 0, 1.
 
         The displacement of particles that lie in the boxes beside is that of wrapped positions, hardly rounded.
         """
@@ -149,7 +150,7 @@ def place_values(values: tuple[Value, ...], column: str, axis: str) -> list[str]
     return [column.format(next(numbers)) if value.axis is None else axis.format(value.axis) for value in values]
 
 
-def constants_of(term: TermText, compensated: bool, extremes: bool, turned: bool = True, by_rows: bool = False) -> dict[str, int]:
+def constants_of(term: TermText, kind: Kind, turned: bool = True, by_rows: bool = False) -> dict[str, int]:
     """Return the named integers that a program with a term needs, but for CANDIDATES, how many pairs are held.
 
     `turned`: a column of turns stands behind those of i, if the term reads lattice shifts. `by_rows`: rows of particles hold these,
@@ -160,7 +161,7 @@ def constants_of(term: TermText, compensated: bool, extremes: bool, turned: bool
     found["FIRST_SUMS"] = term.first or found["ROW_SUMS"]
     own = sum(value.axis is None for value in term.own) + (turned and bool(term.steps))
     own = len(term.own_columns) if by_rows else own
-    return found | {"OWN": own, "COMPENSATED": compensated, "SUMS": 1 + extremes}
+    return found | {"OWN": own, "COMPENSATED": kind.compensated, "SUMS": 1 + kind.extremes}
 
 
 def term_header(term: TermText, double: bool, turned: bool = True, by_rows: bool = False) -> dict[str, str]:
@@ -256,8 +257,7 @@ def sort_kernel(dim: int, double: bool) -> Kernel:
     Behind these stand columns of the coordinates and turns of the sources, if `reads_rows`, where any particle has turns.
     """
     constants: dict[str, int] = {**GRID, "CHUNK": CHUNK, "MANY": 0}
-    text = program(double, dim, "sort_values.h", **constants)
-    return declare(f"sort_values_{dim}d_{'f64' if double else 'f32'}", text, "SortValues.run")[0]
+    return declare_kind(Kind(dim, double), "sort_values", "sort_values.h", "SortValues.run", constants=constants)[0]
 
 
 def work(text: str) -> int:
@@ -274,39 +274,17 @@ def _candidates(term: TermText, dim: int, double: bool) -> int:
 
 
 @functools.lru_cache(512)
-def query_kernel(
-    term: TermText, key: str, dim: int, double: bool, scaled: bool, compensated: bool, periodic: int = 0, batched: int = 0,
-    extremes: bool = False, packed: bool | None = None, excluding: int = 0, rule: str = "",
-) -> Kernel:  # fmt: skip
+def query_kernel(kind: Kind, term: TermText, key: str) -> Kernel:
     """Return the kernel that sums a term; `key` tells it from all others in the names of programs.
 
-    `extremes`: it finds the largest summands instead; `errors` [m, width, 2] then gets their sources (n: there is none), and the
-    codes of their images, as integers travel among floats.
-    `packed`: the term is evaluated for what is near alone, not for other candidates; None: as is faster.
-    `rule`: one of `RULES`, where cutoffs differ; then sources stand in a tree (`jfrnn.kernels.tree_cpu`).
+    For extremes, `errors` [m, width, 2] gets the sources of the largest summands (n: there is none), and the codes of their images,
+    as integers travel among floats. Where cutoffs differ, sources stand in a tree (`jfrnn.kernels.tree_cpu`).
     """
     operations = work(term.unshifted or term.text)
-    packed = operations > LITTLE_WORK if packed is None else packed
-    variant = f"{dim}d_{'f64' if double else 'f32'}{'_scaled' * scaled}{'_compensated' * compensated}"
-    variant += (
-        f"{SPACES[periodic]}{BATCHES[batched]}{'_extremes' * extremes}{'_excluding' * excluding}{'_' * bool(rule)}{rule}_{key}"
-    )
-    constants = {"SCALED": scaled, "LIST": 0, **GRID, **constants_of(term, compensated, extremes, by_rows=True)}
-    constants |= {
-        "COLUMNS": len(term.other_columns),
-        "READS_ROWS": term.reads_rows,
-        "PERIODIC": periodic,
-        "BATCHED": batched,
-        "EXCLUDING": excluding,
-        "CHUNK": CHUNK,
-        "QUERY_CHUNK": QUERY_CHUNK,
-        "CANDIDATES": _candidates(term, dim, double),
-    }
     works = operations > VERY_LITTLE_WORK
-    constants |= {"MANY": 0, "PACKED": packed, "SKIPPED": works, "TOGETHER": TOGETHER_AT_WORK if works else TOGETHER}
-    given = term_header(term, double, by_rows=True)
-    if rule:
-        constants |= tree_cpu.constants_of(rule)
-        given |= tree_cpu.PROVIDER
-    text = program(double, dim, "pair_sum_cpu.h", given=given, **constants)
-    return declare(f"pair_sum_cpu_{variant}", text, "Sums.run")[0]
+    constants = {"LIST": 0, **GRID, **constants_of(term, kind, by_rows=True)}
+    constants |= {"COLUMNS": len(term.other_columns), "READS_ROWS": term.reads_rows, "CHUNK": CHUNK, "QUERY_CHUNK": QUERY_CHUNK}
+    constants |= {"CANDIDATES": _candidates(term, kind.dim, kind.double), "MANY": 0, "PACKED": operations > LITTLE_WORK}
+    constants |= {"SKIPPED": works, "TOGETHER": TOGETHER_AT_WORK if works else TOGETHER, **(tree_cpu.TREE if kind.rule else {})}
+    given = term_header(term, kind.double, by_rows=True) | (tree_cpu.PROVIDER if kind.rule else {})
+    return declare_kind(kind.compiled(), f"pair_sum_cpu_{key}", "pair_sum_cpu.h", "Sums.run", given=given, constants=constants)[0]

@@ -7,7 +7,7 @@ share: of a few pairs at a time, while it evaluates the term for those before. I
 i and j, packed as in `jfrnn._box`: with the image of a neighbor they make its lattice shift S. In place of sums it can find the
 largest summands, and whose they are.
 
-Of a million particles with 108 neighbors (float32), 32 queries meet 570 candidates near their box. Evaluating the term for all
+Where a million particles have 108 neighbors (float32), 32 queries meet 570 candidates near their box. Evaluating the term for all
 of them would take 570 steps of the warp; for the pairs of one block of 32 at a time 345, as lanes wait for the one with most;
 for those of 22 blocks 116. On an H200 a warp executes 9400 instructions for a density, 3600 of them for the pairs it found,
 1900 in tensor cores and around them; schedulers issue in 64 % of their cycles; a fifth of the time warps wait for what they
@@ -21,10 +21,10 @@ many blocks then fit, and 12 % more instructions are executed: 0.59 to 0.65 ms, 
 import functools
 from typing import NamedTuple
 
-from jfrnn.kernels._native import SPACES, program
-from jfrnn.kernels._program import Entry, Kernel, declare
+from jfrnn.kernels._kind import Kind
+from jfrnn.kernels._native import declare_kind
+from jfrnn.kernels._program import Entry, Kernel
 from jfrnn.kernels.cells_cuda import GRID, QUERY_BLOCK, Launch, query_blocks, walks
-from jfrnn.kernels.cells_cuda import constants_of as constants_of_rule
 from jfrnn.kernels.pair_sum_cpu import LITTLE_WORK, TermText, constants_of, term_header, work
 
 
@@ -72,46 +72,32 @@ def _placed_columns(term: TermText, dim: int) -> int:
 
 
 @functools.lru_cache(512)
-def sum_kernels(
-    term: TermText, key: str, dim: int, double: bool, scaled: bool, compensated: bool, periodic: int = 0, batched: bool = False,
-    extremes: bool = False, excluding: int = 0, rule: str = "", tree: bool = False,
-) -> Kernels:  # fmt: skip
+def sum_kernels(kind: Kind, term: TermText, key: str) -> Kernels:
     """Return the kernels that sum a term; `key` tells it from all others in the names of programs.
 
-    `extremes`: they find the largest summands instead; `errors` [m, width, 2] then gets their sources (n: there is none), and the
-    codes of their images, as integers travel among floats. `tree`: sources stand in the tree of `jfrnn.kernels.tree_cuda`.
+    For extremes, `errors` [m, width, 2] gets the sources of the largest summands (n: there is none), and the codes of their images,
+    as integers travel among floats.
     """
     # `taken` is how many pairs a lane adds before it looks for the next block; `blocks` per multiprocessor bound registers. Both
     # are what was fastest on an H200: rows of several loads wait in registers, and are 1.3 times slower if four are loaded ahead.
-    cheap = work(term.text) <= LITTLE_WORK and row_length(term, dim, double) <= 4
-    taken = 4 if cheap else 2
-    blocks = 16 if double or not cheap else 20
-    kind = f"{dim}d_{'f64' if double else 'f32'}{'_scaled' * scaled}{'_compensated' * compensated}"
-    kind += f"{SPACES[periodic]}{'_batched' * batched}{'_extremes' * extremes}{'_excluding' * excluding}{'_' * bool(rule)}{rule}"
-    kind += "_tree" * tree
-    module = f"{kind}_b{blocks}_t{taken}_{key}"
-    constants = {**GRID, "PERIODIC": periodic, "BATCHED": batched, "SCALED": scaled, **constants_of(term, compensated, extremes)}
-    constants |= {
-        "LIST": 0,
-        "LATER": 0,
-        "EXCLUDING": excluding,
-        "TAKEN": taken,
-        "FROM_PLACES": _reads_positions(term) and not term.source_columns,
-    }
-    constants |= {"TREE": tree, **(constants_of_rule(rule) if rule else {})}
-    constants |= {"ROW_LENGTH": max(row_length(term, dim, double), 1), "PLACED": _placed_columns(term, dim)}
+    length = row_length(term, kind.dim, kind.double)
+    cheap = work(term.text) <= LITTLE_WORK and length <= 4
+    blocks = 16 if kind.double or not cheap else 20
+    from_places = _reads_positions(term) and not term.source_columns
+    constants = {**GRID, **constants_of(term, kind), "LIST": 0, "LATER": 0, "TAKEN": 4 if cheap else 2, "FROM_PLACES": from_places}
+    constants |= {"ROW_LENGTH": max(length, 1), "PLACED": _placed_columns(term, kind.dim)}
 
-    def declare_one(name: str, text: str, method: str, blocks: int, called: str = "") -> Kernel:
-        return declare(f"{name}_{module}", text, Entry(method, QUERY_BLOCK, blocks, called), cuda=True, fused=True)[0]
+    declare_one = functools.partial(declare_kind, kind.compiled(), cuda=True)
 
     def query_kernel(name: str, crossing: bool = False) -> Kernel:
-        where = {"CROSSING": crossing, "SHIFTED": periodic if crossing else 0}
-        text = program(double, dim, "pair_sum.cuh", given=term_header(term, double), **constants | where)
-        return declare_one(name, text, "Sums.run", blocks, "Sums_cross" * crossing)
+        where = {"CROSSING": crossing, "SHIFTED": kind.periodic if crossing else 0}
+        entry = Entry("Sums.run", QUERY_BLOCK, blocks, "Sums_cross" * crossing)
+        given = term_header(term, kind.double)
+        return declare_one(f"{name}_{key}", "pair_sum.cuh", entry, given=given, constants=constants | where)[0]
 
-    sorting = program(double, dim, "sort_values.cuh", given={}, **constants)
+    sorting = Entry("SortValues.run", QUERY_BLOCK, 32)
     return Kernels(
-        declare_one("sort_values", sorting, "SortValues.run", 32) if term.source_columns else None,
-        query_kernel("pair_sum", crossing=tree and periodic > 0),
-        query_kernel("crossing_pair_sum", crossing=True) if periodic and not tree else None,
+        declare_one(f"sort_values_{key}", "sort_values.cuh", sorting, constants=constants)[0] if term.source_columns else None,
+        query_kernel("pair_sum", crossing=kind.tree and kind.periodic > 0),
+        query_kernel("crossing_pair_sum", crossing=True) if kind.periodic and not kind.tree else None,
     )

@@ -3,6 +3,7 @@
 import functools
 from typing import NamedTuple
 
+from jfrnn.kernels._kind import Kind
 from jfrnn.kernels._native import program
 from jfrnn.kernels._program import Entry, Kernel, declare
 from jfrnn.kernels.cells_cuda import place_words
@@ -29,9 +30,9 @@ def blocks(n: int) -> int:
 @functools.lru_cache(64)
 def renew_kernels(dim: int, double: bool, periodic: bool, ordered: bool, told: tuple[tuple[str, int], ...]) -> RenewKernels:
     """Return the kernels for a dimension, a dtype and a space; `told` are constants that other floors decide, with their names."""
+    kind = Kind(dim, double, periodic=periodic)
     first, words, word = place_words(2 if double else 1)
     constants = {"ORDERED": ordered, "FIRST_PLACE": first, "PLACE_WORDS": words, "PLACE_WORD": word, "BLOCK": BLOCK}
-    text = program(double, dim, "renew.cuh", PERIODIC=periodic, **constants, **dict(told))
-    variant = f"{dim}d_{'f64' if double else 'f32'}{'_nearest' * periodic}{'_ordered' * ordered}"
+    text = program(kind, "renew.cuh", constants=constants | dict(told))
     entries = [Entry(f"Renew.{method}", BLOCK, 4) for method in RenewKernels._fields]
-    return RenewKernels(*declare(f"renew_cuda_{variant}", text, *entries, cuda=True))
+    return RenewKernels(*declare(f"renew_cuda_{kind.name}{'_ordered' * ordered}", text, *entries, cuda=True))

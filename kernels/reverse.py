@@ -2,10 +2,12 @@
 
 import functools
 
+from jfrnn.kernels._kind import Kind
 from jfrnn.kernels._native import program
 from jfrnn.kernels._program import Entry, Kernel, declare
 
 ROWS_AT_ONCE = 64  # that a thread of the CPU takes
+_CHUNK = {"QUERY_CHUNK": ROWS_AT_ONCE}
 LANES_PER_SLOT = 8  # on CUDA
 LANES_PER_ROW = 32  # likewise, where rows become flat
 
@@ -14,7 +16,7 @@ LANES_PER_ROW = 32  # likewise, where rows become flat
 def reverse_kernels(code_bytes: int, cuda: bool) -> tuple[Kernel, Kernel]:
     """Return what clears, and finds, the reverse slots of a list whose image codes take so many bytes, 0 where there are none."""
     header, block = ("reverse.cuh", 256) if cuda else ("reverse_cpu.h", 1)
-    text = program(False, 3, header, CODE_BYTES=code_bytes, QUERY_CHUNK=ROWS_AT_ONCE)
+    text = program(Kind(3, False), header, constants={"CODE_BYTES": code_bytes, **_CHUNK})
     entries = (Entry(f"Reverse.{method}", block, 4) for method in ("clear", "run"))
     clear, find = declare(f"reverse_{'cuda' if cuda else 'cpu'}_{code_bytes}", text, *entries, cuda=cuda)
     return clear, find
@@ -27,19 +29,19 @@ def collect_kernel(width: int, double: bool, by_source: bool, cuda: bool) -> Ker
     `by_source`: slots are sorted by source; otherwise each source has a row of them.
     """
     name = f"collect_{'cuda' if cuda else 'cpu'}_{width}_{'f64' if double else 'f32'}{'_sorted' * by_source}"
-    text = program(double, 3, "collect.h", WIDTH=width, REVERSED=by_source, QUERY_CHUNK=ROWS_AT_ONCE)
+    text = program(Kind(3, double), "collect.h", constants={"WIDTH": width, "REVERSED": by_source, **_CHUNK})
     return declare(name, text, Entry("Collect.run", 128 if cuda else 1, 8), cuda=cuda)[0]
 
 
 @functools.cache
 def flatten_kernel(cuda: bool) -> Kernel:
     """Return the kernel that finds the slots of a list that hold a pair, one after another."""
-    text = program(False, 3, "flatten.h", QUERY_CHUNK=ROWS_AT_ONCE)
+    text = program(Kind(3, False), "flatten.h", constants=_CHUNK)
     return declare(f"flatten_{'cuda' if cuda else 'cpu'}", text, Entry("Flatten.run", 128 if cuda else 1, 8), cuda=cuda)[0]
 
 
 @functools.cache
 def transpose_kernel() -> Kernel:
     """Return the kernel that sorts the slots of a list by source, on the CPU."""
-    text = program(False, 3, "reverse_cpu.h", CODE_BYTES=0, QUERY_CHUNK=ROWS_AT_ONCE)
+    text = program(Kind(3, False), "reverse_cpu.h", constants={"CODE_BYTES": 0, **_CHUNK})
     return declare("transpose_cpu", text, "Transpose.run")[0]

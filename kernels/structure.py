@@ -2,6 +2,7 @@
 
 import functools
 
+from jfrnn.kernels._kind import Kind
 from jfrnn.kernels._native import program
 from jfrnn.kernels._program import Kernel, declare
 
@@ -13,5 +14,5 @@ WRONG = {1: "not finite", 2: "too far", 4: "degenerate"}
 @functools.cache
 def structure_kernel() -> Kernel:
     """Return the kernel, which one thread runs."""
-    text = program(True, 3, "structure_cpu.h", PERIODIC=4, SUM=1)
+    text = program(Kind(3, True, periodic=4), "structure_cpu.h", constants={"SUM": 1})
     return declare("structure_cpu", text, "Structure.run")[0]

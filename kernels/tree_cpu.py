@@ -1,10 +1,10 @@
 """Search on the CPU where cutoffs differ: in cells where they are alike, else in a tree of boxes around sources along a curve.
 
-`build` decides which, by a sample (`native/cutoffs_cpu.h`): cells find the candidates of queries in half the time, if what they
+`build` decides which, by a sample (`cutoffs_cpu.h`): cells find the candidates of queries in half the time, if what they
 hold beyond what is near is not many times as much. It sorts sources and queries by cell, or along a curve and makes the tree
-(`native/tree_cpu.h`); `gather` puts many sources in order. Then threads hand themselves chunks of queries: those that follow each
-other, and whose cutoffs are alike, find the cells (`native/cell_walk_cpu.h`) or the leaves (`native/tree_walk_cpu.h`) that are near
-all of them, and meet their sources (`native/walk_cpu.h`). So time follows pairs and particles, whatever the spread of cutoffs is,
+(`tree_cpu.h`); `gather` puts many sources in order. Then threads hand themselves chunks of queries: those that follow each
+other, and whose cutoffs are alike, find the cells (`cell_walk_cpu.h`) or the leaves (`tree_walk_cpu.h`) that are near
+all of them, and meet their sources (`walk_cpu.h`). So time follows pairs and particles, whatever the spread of cutoffs is,
 and whatever the density.
 """
 
@@ -12,8 +12,9 @@ import functools
 import itertools
 
 from jfrnn.kernels import cells_cpu
-from jfrnn.kernels._native import BATCHES, RULES, SPACES, place_parts, program, table_cells
-from jfrnn.kernels._program import Kernel, declare
+from jfrnn.kernels._kind import Kind
+from jfrnn.kernels._native import declare_kind, place_parts, table_cells
+from jfrnn.kernels._program import Kernel
 
 LEAF = 16  # sources of a leaf
 FANOUT = 16  # nodes of a node
@@ -42,41 +43,25 @@ def scratch_words(sources: int, queries: int, dim: int, width: int, own: bool, s
 
 
 PROVIDER = {"places_cpu.h": '#include "cutoffs_cpu.h"\n', "query_walk_cpu.h": '#include "cutoff_walk_cpu.h"\n'}  # in place of cells
+TREE = {"LEAF": LEAF, "FANOUT": FANOUT, "CLASS_BITS": CLASS_BITS, "LEAST_TOGETHER": LEAST_TOGETHER}
+TREE |= {"MOST_TOGETHER": MOST_TOGETHER, "MOST_DOUBLED": MOST_DOUBLED, "MOST_HALVED": MOST_HALVED}
 
 
-def constants_of(rule: str) -> dict[str, int]:
-    """Return the constants of programs for cutoffs that differ by a rule."""
-    constants: dict[str, int] = {"RULE": RULES.index(rule), "SUM": rule == "mean", "SCALED": True, "LEAF": LEAF, "FANOUT": FANOUT}
-    constants |= {"CLASS_BITS": CLASS_BITS, "LEAST_TOGETHER": LEAST_TOGETHER, "MOST_TOGETHER": MOST_TOGETHER}
-    return constants | {"MOST_DOUBLED": MOST_DOUBLED, "MOST_HALVED": MOST_HALVED}
-
-
-def _constants(rule: str, periodic: int, batched: int) -> dict[str, int]:
-    found = {**cells_cpu.GRID, "PERIODIC": periodic, "BATCHED": batched, "SUMS": 0, "LIST": 0, **constants_of(rule)}
-    found |= {"CHUNK": cells_cpu.CHUNK, "QUERY_CHUNK": cells_cpu.QUERY_CHUNK}
-    return found | {"MANY": cells_cpu.MANY, "TOGETHER": cells_cpu.TOGETHER}
-
-
-def _variant(dim: int, double: bool, rule: str, periodic: int, batched: int) -> str:
-    return f"{dim}d_{'f64' if double else 'f32'}_{rule}{SPACES[periodic]}{BATCHES[batched]}"
+def _constants(kind: Kind) -> dict[str, int]:
+    lists = {"SUMS": 0, "LIST": kind.lists}
+    return {**cells_cpu.GRID, **lists, **TREE, **cells_cpu.CHUNKS, "TOGETHER": cells_cpu.TOGETHER}
 
 
 @functools.lru_cache(128)
-def sort_kernels(dim: int, double: bool, rule: str, periodic: int = 0, batched: int = 0) -> tuple[Kernel, Kernel]:
-    """Return `build` and `gather`, for a rule of `RULES`, as `jfrnn.kernels.cells_cpu.sort_kernels` does."""
-    text = program(double, dim, "cutoffs_cpu.h", **_constants(rule, periodic, batched))
-    build, gather = declare(
-        f"sort_tree_cpu_{_variant(dim, double, rule, periodic, batched)}", text, "CutoffSort.build", "TreePlaces.gather"
-    )
+def sort_kernels(kind: Kind) -> tuple[Kernel, Kernel]:
+    """Return `build` and `gather`, as `jfrnn.kernels.cells_cpu.sort_kernels` does."""
+    kind, entries = kind.only("scaled", "periodic", "batched", "rule"), ("CutoffSort.build", "TreePlaces.gather")
+    build, gather = declare_kind(kind, "sort_tree_cpu", "cutoffs_cpu.h", *entries, constants=_constants(kind))
     return build, gather
 
 
 @functools.lru_cache(512)
-def query_kernel(
-    dim: int, double: bool, rule: str, lists: bool, periodic: int = 0, batched: int = 0, excluding: int = 0, flat: bool = False
-) -> Kernel:
-    """Return what lists or counts, whose work threads share; options are those of `jfrnn.kernels._native.program`."""
-    constants = {**_constants(rule, periodic, batched), "LIST": lists, "FLAT": flat, "EXCLUDING": excluding}
-    constants["CANDIDATES"] = 1024 if double else 1536  # as many as among cells
-    variant = f"{_variant(dim, double, rule, periodic, batched)}{'_list' * lists}{'_flat' * flat}{'_excluding' * excluding}"
-    return declare(f"tree_cpu_{variant}", program(double, dim, "rows_cpu.h", given=PROVIDER, **constants), "Rows.run")[0]
+def query_kernel(kind: Kind) -> Kernel:
+    """Return what lists or counts, whose work threads share."""
+    constants = {**_constants(kind), "CANDIDATES": cells_cpu.CANDIDATES[kind.double]}
+    return declare_kind(kind.compiled("later"), "tree_cpu", "rows_cpu.h", "Rows.run", given=PROVIDER, constants=constants)[0]

@@ -10,17 +10,10 @@ Time follows pairs and particles: boxes are as small as 32 sources are close to 
 
 import functools
 
-from jfrnn.kernels._native import SPACES, place_parts, program
-from jfrnn.kernels._program import Entry, Kernel, declare
-from jfrnn.kernels.cells_cuda import (
-    BLOCK,
-    GRID,
-    HEADER_WORDS,
-    QUERY_BLOCK,
-    constants_of,
-    query_blocks,
-    walking_blocks,
-)
+from jfrnn.kernels._kind import Kind
+from jfrnn.kernels._native import declare_kind, place_parts
+from jfrnn.kernels._program import Entry, Kernel
+from jfrnn.kernels.cells_cuda import BLOCK, GRID, HEADER_WORDS, QUERY_BLOCK, query_blocks, walking_blocks
 
 HEADER_BYTES = 4 * HEADER_WORDS  # of the scratch, which are cleared first
 _NODE_WORDS = 12  # of the box of a node, at most, in float32
@@ -43,12 +36,10 @@ def scratch_words(sources: int, queries: int, dim: int, width: int, own: bool) -
 
 
 @functools.lru_cache(512)
-def fit_kernel(dim: int, double: bool, rule: str, periodic: int = 0, batched: bool = False) -> Kernel:
+def fit_kernel(kind: Kind) -> Kernel:
     """Return the kernel that fits the boxes of a level."""
-    kind = f"{dim}d_{'f64' if double else 'f32'}{SPACES[periodic]}{'_batched' * batched}_{rule}"
-    constants = {**GRID, **constants_of(rule), "TREE": 1, "PERIODIC": periodic, "BATCHED": batched}
-    text = program(double, dim, "fit_tree.cuh", **constants)
-    return declare(f"fit_tree_cuda_{kind}", text, Entry("FitTree.run", BLOCK), cuda=True, fused=True)[0]
+    kind = kind.only("scaled", "periodic", "batched", "rule")._replace(tree=True)
+    return declare_kind(kind, "fit_tree_cuda", "fit_tree.cuh", Entry("FitTree.run", BLOCK), cuda=True, constants=GRID)[0]
 
 
 def fit_threads(sources: int, queries: int, own: bool) -> list[int]:
@@ -63,15 +54,8 @@ def walk_threads(queries: int) -> int:
 
 
 @functools.lru_cache(512)
-def query_kernel(
-    dim: int, double: bool, rule: str, lists: bool, later: bool = False, periodic: int = 0, batched: bool = False,
-    excluding: int = 0, flat: bool = False,
-) -> Kernel:  # fmt: skip
-    """Return the kernel that lists or counts; the arguments are those of `jfrnn.kernels.cells_cuda.cell_kernels`."""
-    variant = f"{dim}d_{'f64' if double else 'f32'}{SPACES[periodic]}{'_batched' * batched}{'_list' * lists}{'_flat' * flat}"
-    variant += f"{'_later' * later}{'_excluding' * excluding}_{rule}"
-    constants = {**GRID, **constants_of(rule), "TREE": 1, "CROSSING": periodic > 0, "PERIODIC": periodic, "SHIFTED": periodic}
-    constants |= {"BATCHED": batched, "LIST": lists, "FLAT": flat, "SUMS": 0, "LATER": later}
-    text = program(double, dim, "rows.cuh", **constants, EXCLUDING=excluding)
-    entry = Entry("Rows.run", QUERY_BLOCK, walking_blocks(lists, double), "Rows_of_tree")
-    return declare(f"tree_cuda_{variant}", text, entry, cuda=True, fused=True)[0]
+def query_kernel(kind: Kind) -> Kernel:
+    """Return the kernel that lists or counts."""
+    constants = {**GRID, "CROSSING": kind.periodic > 0, "LIST": kind.lists, "SUMS": 0, "LATER": kind.later}
+    entry = Entry("Rows.run", QUERY_BLOCK, walking_blocks(kind), "Rows_of_tree")
+    return declare_kind(kind.compiled()._replace(tree=True), "tree_cuda", "rows.cuh", entry, cuda=True, constants=constants)[0]

@@ -5,6 +5,7 @@ Threads hand themselves chunks of pairs from an atomic counter.
 
 import functools
 
+from jfrnn.kernels._kind import Kind
 from jfrnn.kernels._native import program
 from jfrnn.kernels._program import Kernel, declare
 from jfrnn.kernels._triangles import constants
@@ -16,5 +17,5 @@ CHUNK = 4096  # pairs that a thread takes at a time
 def pairs_kernel(dim: int, double: bool) -> Kernel:
     """Return the kernel for a dimension and dtype, the work of which threads share."""
     options = {"CHUNK": CHUNK, **constants(dim, double, stride=1)}
-    text = program(double, dim, "triangle_pairs.h", **options)
+    text = program(Kind(dim, double), "triangle_pairs.h", constants=options)
     return declare(f"triangle_pairs_{dim}d_{'f64' if double else 'f32'}", text, "TrianglePairs.run")[0]

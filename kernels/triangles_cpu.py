@@ -8,6 +8,7 @@ Threads that run `query` hand themselves chunks of particles from an atomic coun
 import functools
 from typing import NamedTuple
 
+from jfrnn.kernels._kind import Kind
 from jfrnn.kernels._native import program
 from jfrnn.kernels._program import Kernel, declare
 from jfrnn.kernels._triangles import constants, pending
@@ -32,5 +33,5 @@ def triangle_kernels(dim: int, double: bool, lists: bool, tree: bool, most_cells
     options = {"LIST": lists, "MOST_CELLS": most_cells, "MOST_ALONG": lanes, "CHUNK": CHUNK}
     options |= {"MOST_ALONG_LOG2": lanes.bit_length() - 1, "NODE": node, "PENDING": pending(node), "TREE": tree}
     options |= constants(dim, double, stride=1)
-    text = program(double, dim, "triangles_cpu.h", **options)
+    text = program(Kind(dim, double), "triangles_cpu.h", constants=options)
     return Kernels(*declare(f"triangles_cpu_{variant}", text, "TriangleSort.build", "TriangleRows.run"))

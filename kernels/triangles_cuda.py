@@ -27,6 +27,7 @@ thread asks 16 boxes one after the other for each node (experiments/results/tria
 import functools
 from typing import NamedTuple
 
+from jfrnn.kernels._kind import Kind
 from jfrnn.kernels._native import place_parts, program
 from jfrnn.kernels._program import Entry, Kernel, declare
 from jfrnn.kernels._triangles import constants, pending
@@ -87,7 +88,7 @@ def triangle_kernels(dim: int, double: bool, lists: bool, tree: bool, node: int)
     options |= {"PENDING": pending(node), **constants(dim, double, stride=32)}
 
     def stages(name: str, *methods: str, block: int, blocks: int = 1) -> list[Kernel]:
-        text = program(double, dim, "triangles.cuh", THREADS=block, **options)
+        text = program(Kind(dim, double), "triangles.cuh", constants={"THREADS": block, **options})
         entries = [Entry(f"Triangles.{method}", block, blocks) for method in methods]
         return declare(f"triangles_cuda_{name}_{kind}{'_list' * lists}", text, *entries, cuda=True)
 

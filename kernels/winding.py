@@ -8,6 +8,7 @@ a ray then tells the side but for some 1e-14 of the largest coordinate.
 
 import functools
 
+from jfrnn.kernels._kind import Kind
 from jfrnn.kernels._native import program
 from jfrnn.kernels._program import Entry, Kernel, declare
 from jfrnn.kernels._triangles import pending
@@ -20,5 +21,5 @@ BLOCK = 128
 def side_kernel(dim: int, double: bool, node: int, cuda: bool) -> Kernel:
     """Return the kernel for a dimension, a dtype and a tree of `node` children each: on CUDA for a thread per point."""
     variant = f"{'cuda' if cuda else 'cpu'}_{dim}d_{'f64' if double else 'f32'}"
-    text = program(double, dim, "winding.h", NODE=node, PENDING=pending(node), CHUNK=CHUNK)
+    text = program(Kind(dim, double), "winding.h", constants={"NODE": node, "PENDING": pending(node), "CHUNK": CHUNK})
     return declare(f"winding_{variant}", text, Entry("Winding.run", BLOCK), cuda=cuda)[0]

@@ -9,7 +9,7 @@ import numpy as np
 
 from jfrnn._sums import translate as _translate
 from jfrnn._sums.scalars import TYPES
-from jfrnn.kernels import declare
+from jfrnn.kernels import Kind, declare
 from jfrnn.kernels._native import program
 
 LANES = {"float32": 16, "float64": 8}
@@ -78,7 +78,7 @@ def native_text(texts, real, kind):
     lanes, number, of_real = LANES[real] if kind == "vector" else 1, NUMBER[real], TYPES[real]
     count = f"#define JFRNN_SCALAR {int(kind != 'vector')}\nconstexpr int LANES = {lanes};\n"
     given = {"lane_count.h": '#include "constants.h"\n#include "device.h"\n' + count}
-    text = program(real == "float64", 3, "constants.h", "float_control.h", "math.h", given=given)
+    text = program(Kind(3, real == "float64"), "constants.h", "float_control.h", "math.h", given=given)
     start = ["const FloatControl floats;"]
     if kind == "vector":
         start.append(

@@ -17,9 +17,9 @@ from jfrnn._engine.operands import MOST_IN_BOX, as_float
 from jfrnn._engine.plans import Clear, Launch, Plan, ask_for_huge_pages, share
 from jfrnn._engine.problem import (
     Engine,
+    Features,
     Filter,
     Inputs,
-    Kind,
     Options,
     Search,
     find_bits,
@@ -34,6 +34,6 @@ from jfrnn._engine.rows import Found, add_up, count_rows, fold_pairs, list_flat,
 from jfrnn._engine.runs import FOLD_GROUP, Block, Slots, Visit
 from jfrnn._engine.start import compiler, level_of_caller
 from jfrnn._engine.structure import Structure, find_structure_pairs
-from jfrnn._engine.sum_results import FoundSums
+from jfrnn._engine.sum_results import FoundSums, Summed
 from jfrnn._engine.warp import PLATFORMS, has_order
 from jfrnn._engine.warp_sums import pair_sums

@@ -23,7 +23,7 @@ from jax import Array, lax
 
 from jfrnn._engine.boxes import find_in_boxes
 from jfrnn._engine.candidates import Candidates, Excluded, Points, Span, Torus
-from jfrnn._engine.problem import Kind, Options, Room, Rows, Search, largest_radius
+from jfrnn._engine.problem import Features, Options, Room, Rows, Search, largest_radius
 from jfrnn._engine.runs import State, count_neighbors, fill_neighbors, list_neighbors
 from jfrnn._engine.tuning import Tuning, by_platform
 from jfrnn._engine.words import CHUNK, LANES
@@ -67,8 +67,9 @@ class ArrayEngine:
     by_cells: bool
     static_radius = False
     translates = False
+    native = False
 
-    def refuse(self, kind: Kind) -> str | None:
+    def refuse(self, asked: Features) -> str | None:
         """Return None: it supports every search."""
         return None
 

@@ -11,7 +11,7 @@ from jax.core import Tracer
 
 from jfrnn._engine.arrays import ArrayEngine
 from jfrnn._engine.hashgrid import HashGridEngine
-from jfrnn._engine.problem import ANYTHING, Engine, Kind
+from jfrnn._engine.problem import ANYTHING, Engine, Features
 from jfrnn._engine.start import check_warp, level_of_caller
 from jfrnn._engine.warp import WarpEngine
 
@@ -42,7 +42,7 @@ def parse_backend(backend: object, engines: Mapping[str, AnyEngine], where: str 
     return engines.get(backend)
 
 
-def choose_engine(named: Engine | None, sources: Array, queries: Array | None, kind: Kind = ANYTHING) -> Engine:
+def choose_engine(named: Engine | None, sources: Array, queries: Array | None, kind: Features = ANYTHING) -> Engine:
     """Return this engine, or the fastest (None); raise if a named engine does not support the search or cannot run here.
 
     Raises:
@@ -54,11 +54,9 @@ def choose_engine(named: Engine | None, sources: Array, queries: Array | None, k
         return fastest_engine(platform_of(sources, sources if queries is None else queries), sources.shape[0])
     if reason := named.refuse(kind):
         raise ValueError(f"backend={named.name!r} {reason}")
-    if isinstance(named, ArrayEngine):
-        return named
-    check_warp()
     platform = platform_of(sources, sources if queries is None else queries)
     if reason := _what_is_missing(named, platform):
+        check_warp()  # says what to install
         raise RuntimeError(f"backend={named.name!r} cannot run on the platform {platform!r}: {reason}. Pass backend='jax'.")
     return named
 

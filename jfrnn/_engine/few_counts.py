@@ -1,7 +1,7 @@
 """How many neighbors few particles have, without a program for their number: by the kernel of one structure after another.
 
-A compiled count takes a tenth of a second to make and hardly any time to run. Of shapes that come a few times, as in a data set of
-crystals, it would be compiled for nothing.
+A compiled count takes a tenth of a second to make and hardly any time to run. For shapes that come a few times, as in a data set
+of crystals, it would be compiled for nothing.
 """
 
 from collections import OrderedDict
@@ -33,7 +33,7 @@ def count_few(inputs: Inputs, options: Options) -> np.ndarray | None:
     if (
         not plain
         or not isinstance(cutoff, Cutoff)
-        or not options.engine.translates
+        or not options.engine.native
         or options.closed
         or not 0 < n <= _MOST
         or (box is not None and box.per_system)

@@ -9,12 +9,12 @@ from typing import Any
 
 from jfrnn._engine.launch import Call, Shapes, kernel
 from jfrnn._engine.plans import Clear, Kept, Launch, Plan
-from jfrnn._engine.problem import Kind, Options, Room, Rows, Search
+from jfrnn._engine.problem import Features, Options, Room, Rows, Search
 from jfrnn._engine.start import INSTALL, load_warp
-from jfrnn._engine.variants import Variant, absent, describe_call, huge_pages, plan_numbers
+from jfrnn._engine.variants import absent, describe_call, huge_pages, plan_numbers
 from jfrnn._engine.warp import call_kernels, check_platform, missing
 from jfrnn._tracing import on_platform
-from jfrnn.kernels import _clang, hashgrid
+from jfrnn.kernels import Kind, _clang, hashgrid
 
 HashGrid = Any  # the type of Warp, which cannot be named before it is imported
 
@@ -26,19 +26,20 @@ class HashGridEngine:
     name = "hashgrid"
     static_radius = True
     translates = False
+    native = False
     by_cells = True
 
-    def refuse(self, kind: Kind) -> str | None:
+    def refuse(self, asked: Features) -> str | None:
         """Refuse what `wp.HashGrid` has no way to say."""
-        if kind.summed:
+        if asked.summed:
             return "cannot sum over pairs: pass 'warp', 'jax', 'brute' or 'auto'."
-        if kind.excluding:
+        if asked.excluding:
             return "cannot exclude pairs: pass backend='warp', 'jax' or 'brute'."
-        if kind.radii:
+        if asked.radii:
             return "takes one cutoff for all particles: pass backend='warp', 'jax' or 'brute'."
-        if kind.batch:
+        if asked.batch:
             return "knows one system at a time: pass backend='warp', 'jax' or 'brute'."
-        return "knows no periodic box: pass backend='warp', 'jax' or 'brute'." if kind.periodic else None
+        return "knows no periodic box: pass backend='warp', 'jax' or 'brute'." if asked.periodic else None
 
     def missing(self, platform: str) -> str | None:
         """Say what keeps Warp from running on a JAX platform, or its hash grid from being right."""
@@ -55,8 +56,8 @@ class HashGridEngine:
             raise TypeError("the backend 'hashgrid' needs a cutoff that is known while tracing.")
 
         def on(cuda: bool) -> Callable[[Search], Rows]:
-            def make(variant: Variant) -> Callable[..., Any]:
-                return _hashgrid_callable(variant, radius, cuda)
+            def make(kind: Kind) -> Callable[..., Any]:
+                return _hashgrid_callable(kind, radius, cuda)
 
             return functools.partial(call_kernels, hashgrid.scratch_words, make, keep=options.filter, capacity=capacity)
 
@@ -73,25 +74,25 @@ class HashGridEngine:
 
 
 @kernel
-def _hashgrid_callable(variant: Variant, radius: float, cuda: bool) -> Call:
+def _hashgrid_callable(kind: Kind, radius: float, cuda: bool) -> Call:
     """Return what searches on a platform; it knows its radius, and bears it in its name."""
-    plan = functools.partial(_plan, variant, radius, cuda)
-    found = describe_call("hashgrid_cuda" if cuda else "hashgrid_cpu", variant, plan)
+    plan = functools.partial(_plan, kind, radius, cuda)
+    found = describe_call("hashgrid_cuda" if cuda else "hashgrid_cpu", kind, plan)
     return found._replace(name=f"{found.name}_{radius.hex()}")
 
 
-def _plan(variant: Variant, radius: float, cuda: bool, shapes: Shapes, _: int) -> Plan:
-    numbers = plan_numbers(variant, shapes) | hashgrid.split_width(radius)
-    numbers["drop_self"] &= variant.own
+def _plan(kind: Kind, radius: float, cuda: bool, shapes: Shapes, _: int) -> Plan:
+    numbers = plan_numbers(kind, shapes) | hashgrid.split_width(radius)
+    numbers["drop_self"] &= kind.own
     n, m = numbers["n"], numbers["m"]
-    grid = hashgrid.grid_shape(n, variant.dim)
+    grid = hashgrid.grid_shape(n, kind.dim)
     numbers["cells_x"], numbers["cells_y"], _ = grid
-    kernels = hashgrid.search_kernels(variant.dim, variant.double, variant.scaled, variant.lists, cuda, variant.flat)
-    rows = [] if cuda else huge_pages(variant, shapes)
+    kernels = hashgrid.search_kernels(kind, cuda)
+    rows = [] if cuda else huge_pages(kind, shapes)
     pack, query = Launch(kernels.pack, n if cuda else 1), Launch(kernels.query, m if cuda else 1)
-    steps = [Clear("info", 8), pack, Launch(hashgrid.build_kernel(variant.double)), *rows, query]
-    keep = functools.partial(_keep_grid, grid, variant.double, n)
-    return Plan(steps, numbers, absent(variant.lists, variant.flat), keep)
+    steps = [Clear("info", 8), pack, Launch(hashgrid.build_kernel(kind.double)), *rows, query]
+    keep = functools.partial(_keep_grid, grid, kind.double, n)
+    return Plan(steps, numbers, absent(kind), keep)
 
 
 def _keep_grid(shape: tuple[int, int, int], double: bool, points: int, device: int) -> Kept:

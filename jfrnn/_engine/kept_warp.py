@@ -11,12 +11,14 @@ import numpy as np
 from jax import Array
 
 from jfrnn._engine.launch import Call, Shapes, kernel
-from jfrnn._engine.operands import lattice_numbers
+from jfrnn._engine.operands import lattice_numbers, periodic_kind
 from jfrnn._engine.plans import Clear, Launch, Plan, ask_for_huge_pages, share
-from jfrnn._engine.sum_results import FoundSums, SumsOf
+from jfrnn._engine.sum_results import FoundSums, Summed, SumsOf
+from jfrnn._engine.variants import scalar_of
 from jfrnn._geometry import EXCHANGED, LARGEST_TURN, Cutoff, Cutoffs, Lattice
 from jfrnn._tracing import on_platform
-from jfrnn.kernels import kept
+from jfrnn.kernels import Kernel, Kind, kept
+from jfrnn.kernels.kept import ListKind
 from jfrnn.kernels.pair_sum_cpu import TermText
 
 # what a call is given
@@ -77,9 +79,9 @@ def kept_distances(given: KeptList) -> tuple[Array, Array]:
 
 
 def _measure(given: KeptList, cuda: bool, measured: bool) -> dict[str, Array]:
-    kind, shape = _kind_of(given, kept.LANES if cuda else 0), given.idx.shape
+    kind, shape = _kind_of(given, cuda)._replace(measured=measured), given.idx.shape
     dims = {"mask": shape, **({"distances": shape} if measured else {}), "info": 2}
-    return dict(zip(dims, _mask_callable(kind, measured)(*_operands(given, kind, 0, None), output_dims=dims), strict=True))
+    return dict(zip(dims, _mask_callable(kind)(*_operands(given, kind, 0, None), output_dims=dims), strict=True))
 
 
 def kept_slopes(given: KeptList, slots: Array, distances: Array, slopes: Array) -> Array:
@@ -90,7 +92,7 @@ def kept_slopes(given: KeptList, slots: Array, distances: Array, slopes: Array) 
 
     def on(cuda: bool) -> Callable[..., Array]:
         def call(given: KeptList, slots: Array, distances: Array, slopes: Array) -> Array:
-            kind, dims = _kind_of(given, kept.LANES if cuda else 0), {"sums": given.sources.shape, "info": 2}
+            kind, dims = _kind_of(given, cuda), {"sums": given.sources.shape, "info": 2}
             operands = _operands(given, kind, 0, None, slots)
             return _slope_callable(kind)(*operands, distances, slopes, output_dims=dims)[0]
 
@@ -99,21 +101,14 @@ def kept_slopes(given: KeptList, slots: Array, distances: Array, slopes: Array) 
     return on_platform(given, slots, distances, slopes, cpu=on(False), cuda=on(True))
 
 
-def kept_sums(
-    given: KeptList,
-    term: TermText,
-    key: str,
-    values: tuple[Array, Array | None, Array],
-    compensated: bool,
-    apart: bool = False,
-    extremes: bool = False,
-) -> FoundSums:
+def kept_sums(given: KeptList, summed: Summed, values: tuple[Array, Array | None, Array], apart: bool = False) -> FoundSums:
     """Sum a term over the pairs of a list, as `jfrnn._engine.warp_sums.pair_sums` does over those of a search.
 
     `values` are what all pairs share, what is read of i, or None where that is of the same arrays as what is read of j, and what is
-    read of j. `apart`: a particle's pair with itself, without a shift, is left out. Of extremes, the place in the row stands for
-    the code of an image.
+    read of j. `apart`: a particle's pair with itself, without a shift, is left out. An extreme has its place in the row
+    in place of the code of an image.
     """
+    term = summed.term
     mirrored = values[1] is None
 
     def on(cuda: bool) -> Callable[[KeptList, tuple[Array, Array | None, Array]], FoundSums]:
@@ -121,46 +116,48 @@ def kept_sums(
             shared, own, others = values
             own = jnp.zeros((1, 1), given.sources.dtype) if own is None else own
             rows = (given.sources if given.reversal is not None else given.rows).shape[0]
-            lanes = kept.LANES if cuda else 0
-            kind, results = _kind_of(given, lanes), SumsOf(term, rows, kept.slots(rows, lanes), compensated, extremes)
-            call_sums = _sum_callable(kind, term, key, compensated, extremes, apart, mirrored)
+            kind = _kind_of(given, cuda)._replace(apart=apart, mirrored=mirrored)
+            kind = kind._replace(kind=summed.of(kind.kind))
+            results = SumsOf(term, kind.kind, rows, kept.slots(rows, kind.lanes))
             operands = _operands(given, kind, term.columns, others)
-            return results.unpack(*call_sums(*operands, shared, own, output_dims=results.dims() | {"info": 2})[:3])
+            written = _sum_callable(kind, term, summed.key)(*operands, shared, own, output_dims=results.dims() | {"info": 2})
+            return results.unpack(*written[:3])
 
         return call
 
     return on_platform(given, values, cpu=on(False), cuda=on(True))
 
 
-class _Extra(NamedTuple):
-    """What a program carries besides its kind, so that a call is described."""
-
-    closed: bool
-    images: int
-    kind: kept.ListKind
-
-
-def _kind_of(given: KeptList, lanes: int) -> _Extra:
+def _kind_of(given: KeptList, cuda: bool) -> ListKind:
     cutoff, lattice, is_reversed = given.cutoff, given.lattice, given.reversal is not None
-    periodic = 0 if lattice is None else (1 if lattice.images.nearest else 2) + (0 if lattice.images.orthogonal else 2)
-    width = 0 if given.codes is None else given.codes.dtype.itemsize
     rule = cutoff.rule if isinstance(cutoff, Cutoffs) else ""
-    rule = EXCHANGED.get(rule, rule) if is_reversed else rule
-    dim, double, aligned = given.sources.shape[1], given.sources.dtype == jnp.float64, given.idx.shape[1] % 4 == 0
-    ordered = given.order is not None and lanes > 0
-    boxes = given.systems is not None
-    itself = isinstance(cutoff, Cutoffs) and cutoff.itself
-    kind = kept.ListKind(dim, double, cutoff.scaled, periodic, width, rule, is_reversed, aligned, ordered, lanes, boxes, itself)
-    return _Extra(cutoff.closed, 1 if lattice is None else lattice.images.total, kind)
+    kind = Kind(
+        given.sources.shape[1],
+        double=given.sources.dtype == jnp.float64,
+        scaled=cutoff.scaled,
+        closed=cutoff.closed,
+        periodic=periodic_kind(lattice),
+        rule=EXCHANGED.get(rule, rule) if is_reversed else rule,
+    )
+    return ListKind(
+        kind,
+        images=1 if lattice is None else lattice.images.total,
+        code_bytes=0 if given.codes is None else given.codes.dtype.itemsize,
+        reversed=is_reversed,
+        aligned=given.idx.shape[1] % 4 == 0,
+        ordered=given.order is not None and cuda,
+        lanes=kept.LANES if cuda else 0,
+        boxes=given.systems is not None,
+        itself=isinstance(cutoff, Cutoffs) and cutoff.itself,
+    )
 
 
-def _operands(given: KeptList, extra: _Extra, columns: int, others: Array | None, slots: Array | None = None) -> list[Array]:
+def _operands(given: KeptList, kind: ListKind, columns: int, others: Array | None, slots: Array | None = None) -> list[Array]:
     """Return what kernels read of a list, in the order of `_LIST`, with columns of numbers of each source.
 
     `slots` are the reverse slots of a list that is not itself reversed.
     """
-    kind, dtype = extra.kind, given.sources.dtype
-    sources, rows, turns = given.sources, given.rows, given.turns or (None, None)
+    dtype, sources, rows, turns = given.sources.dtype, given.sources, given.rows, given.turns or (None, None)
     if kind.reversed:
         sources, rows, turns = rows, sources, turns[::-1]
     of_sources, of_rows = _radii_of(given, kind)
@@ -195,7 +192,7 @@ def _numbers_of(given: KeptList, cutoff: np.floating | Array) -> Array:
     return row(lattice) if given.systems is None else jax.vmap(row)(lattice)
 
 
-def _radii_of(given: KeptList, kind: kept.ListKind) -> tuple[Array | None, Array | None]:
+def _radii_of(given: KeptList, kind: ListKind) -> tuple[Array | None, Array | None]:
     """Return the cutoffs beside sources and rows, 0 if they are not read.
 
     With a table these are the species of sources, and where the row of a species begins in the table.
@@ -223,55 +220,44 @@ def _beside(length: int, *parts: Array | None, more: int = 0) -> Array:
 
 
 @kernel
-def _mask_callable(extra: _Extra, measured: bool) -> Call:
-    results = {"mask": np.bool_, **({"distances": _scalar(extra)} if measured else {}), "info": np.int32}
-    name = f"jfrnn_kept_{'distances' if measured else 'mask'}_{_name(extra)}"
-    return Call(name, _LIST, results, functools.partial(_plan_mask, extra, measured))
+def _mask_callable(kind: ListKind) -> Call:
+    results = {"mask": np.bool_, **({"distances": scalar_of(kind.kind)} if kind.measured else {}), "info": np.int32}
+    return Call(f"jfrnn_kept_mask_{kind.call}", _LIST, results, functools.partial(_plan_mask, kind))
 
 
 @kernel
-def _slope_callable(extra: _Extra) -> Call:
-    results = {"sums": _scalar(extra), "info": np.int32}
-    name = f"jfrnn_kept_slopes_{_name(extra)}"
-    return Call(name, (*_LIST, "distances", "slopes"), results, functools.partial(_plan_slopes, extra))
+def _slope_callable(kind: ListKind) -> Call:
+    results = {"sums": scalar_of(kind.kind), "info": np.int32}
+    plan = functools.partial(_plan_slopes, kind)
+    return Call(f"jfrnn_kept_slopes_{kind.call}", (*_LIST, "distances", "slopes"), results, plan)
 
 
 @kernel
-def _sum_callable(extra: _Extra, term: TermText, key: str, compensated: bool, extremes: bool, apart: bool, mirrored: bool) -> Call:
-    scalar, flags = _scalar(extra), {"compensated": compensated, "extremes": extremes, "apart": apart, "mirrored": mirrored}
-    name = "_".join(["jfrnn_kept_sums", _name(extra), *(flag for flag, on in flags.items() if on), key])
-    results = dict.fromkeys(("sums", "totals", "errors"), scalar) | {"info": np.int32}
-    plan = functools.partial(_plan_sums, extra, (term, key, compensated, extremes, apart, mirrored))
-    return Call(name, (*_LIST, "shared_values", "own_values"), results, plan)
+def _sum_callable(kind: ListKind, term: TermText, key: str) -> Call:
+    results = dict.fromkeys(("sums", "totals", "errors"), scalar_of(kind.kind)) | {"info": np.int32}
+    plan = functools.partial(_plan_sums, kind, term, key)
+    return Call(f"jfrnn_kept_sums_{kind.call}_{key}", (*_LIST, "shared_values", "own_values"), results, plan)
 
 
-def _scalar(extra: _Extra) -> type:
-    return np.float64 if extra.kind.double else np.float32
-
-
-def _name(extra: _Extra) -> str:
-    return f"{extra.kind.name}{'_closed' * extra.closed}_{extra.images}"
-
-
-def _launch(extra: _Extra, found: kept.Kernel, shapes: Shapes) -> Plan:
+def _launch(kind: ListKind, found: Kernel, shapes: Shapes, _: int) -> Plan:
     (m, capacity), n = shapes["idx"], shapes["points"][0] - 1
-    m = shapes["rows"][0] if extra.kind.reversed else m
-    numbers = {"m": m, "n": n, "capacity": capacity, "images": extra.images, "closed": int(extra.closed)}
-    launch = Launch(found, kept.threads(m, extra.kind.lanes)) if extra.kind.cuda else share(found, m, kept.ROWS_AT_ONCE)
-    return Plan([launch] if extra.kind.cuda else [Clear("info", 8), launch], numbers)
+    m = shapes["rows"][0] if kind.reversed else m
+    numbers = {"m": m, "n": n, "capacity": capacity, "images": kind.images, "closed": int(kind.kind.closed)}
+    launch = Launch(found, kept.threads(m, kind.lanes)) if kind.cuda else share(found, m, kept.ROWS_AT_ONCE)
+    return Plan([launch] if kind.cuda else [Clear("info", 8), launch], numbers)
 
 
-def _plan_mask(extra: _Extra, measured: bool, shapes: Shapes, _: int) -> Plan:
-    plan = _launch(extra, kept.mask_kernel(extra.kind, measured), shapes)
-    if not measured:
+def _plan_mask(kind: ListKind, shapes: Shapes, multiprocessors: int) -> Plan:
+    plan = _launch(kind, kept.mask_kernel(kind), shapes, multiprocessors)
+    if not kind.measured:
         return plan._replace(absent=["distances"])
-    size = np.dtype(_scalar(extra)).itemsize * math.prod(shapes["distances"])
-    return plan if extra.kind.cuda else plan._replace(steps=[*ask_for_huge_pages("distances", size), *plan.steps])
+    size = np.dtype(scalar_of(kind.kind)).itemsize * math.prod(shapes["distances"])
+    return plan if kind.cuda else plan._replace(steps=[*ask_for_huge_pages("distances", size), *plan.steps])
 
 
-def _plan_slopes(extra: _Extra, shapes: Shapes, _: int) -> Plan:
-    return _launch(extra, kept.slope_kernel(extra.kind), shapes)
+def _plan_slopes(kind: ListKind, shapes: Shapes, multiprocessors: int) -> Plan:
+    return _launch(kind, kept.slope_kernel(kind), shapes, multiprocessors)
 
 
-def _plan_sums(extra: _Extra, kind: tuple, shapes: Shapes, _: int) -> Plan:
-    return _launch(extra, kept.sum_kernel(extra.kind, *kind), shapes)
+def _plan_sums(kind: ListKind, term: TermText, key: str, shapes: Shapes, multiprocessors: int) -> Plan:
+    return _launch(kind, kept.sum_kernel(kind, term, key), shapes, multiprocessors)

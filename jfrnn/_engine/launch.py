@@ -3,7 +3,7 @@
 A call names its kernel, for the shapes of its arrays, and says what the kernel was made of. So a program also runs in a process
 that has not traced it: one that was exported, or that comes from JAX's persistent compilation cache.
 
-A call runs native code (`kernels/native/launch.h`), on the thread on which XLA calls, and no Python. Python is asked once for each
+A call runs native code (`native/launch/launch.h`), on the thread on which XLA calls, and no Python. Python is asked once for each
 kernel, by name: it compiles what is launched, and lays down in what order, with which arguments (`jfrnn._engine.plans`).
 """
 

@@ -5,22 +5,18 @@ import numpy as np
 from jax import Array, lax
 
 from jfrnn._engine.problem import Search, largest_radius
-from jfrnn._geometry import CLASSES, Cutoffs, Lattice, Wrapped, octaves_of, order_for_tree
+from jfrnn._geometry import CLASSES, Cutoffs, Lattice, octaves_of, order_for_tree
 from jfrnn.kernels._native import ORDERS, TABLE
 
 MOST_IN_BOX = 1 << 27  # most positions in a box, where ids share their bits with image codes
 
 
-def periodic_kind(torus: tuple[Lattice, Wrapped] | None) -> int:
-    """Return the constant PERIODIC of `jfrnn.kernels._native.program`."""
-    if torus is None:
+def periodic_kind(lattice: Lattice | None) -> int:
+    """Return `periodic` of `jfrnn.kernels.Kind`."""
+    if lattice is None:
         return 0
-    images = torus[0].images
+    images = lattice.images
     return (1 if images.nearest else 2) + (0 if images.orthogonal else 2)
-
-
-def space_flags(periodic: int) -> dict[str, bool]:
-    return {"nearest": periodic in (1, 3), "images": periodic in (2, 4), "skewed": periodic > 2}
 
 
 def particle_rows(points: Array, turns: Array | None, systems: Array | None) -> Array:
@@ -64,7 +60,7 @@ def lattice_numbers(lattice: Lattice, reach: Array, slack: Array, flags: Array |
 
 
 def excluded_rows(search: Search) -> list[Array]:
-    """Return the rows of sources that queries exclude, as kernels read them (see `kernels/native/excluded.h`), if there are any."""
+    """Return the rows of sources that queries exclude, as kernels read them (`native/decide/excluded.h`), if there are any."""
     return [] if search.exclude is None else [search.exclude.starts, search.exclude.names(search.sizes[0])]
 
 

@@ -1,4 +1,4 @@
-"""What is launched when XLA calls: plans, and how they are laid down for native code (`kernels/native/desk.h`)."""
+"""What is launched when XLA calls: plans, and how they are laid down for native code (`kernels/native/launch/desk.h`)."""
 
 import ctypes
 import dataclasses

@@ -57,7 +57,7 @@ class Room(NamedTuple):
 class Rows(NamedTuple):
     """Neighbors of m queries: [m, capacity] int32 source indices, unused slots n (None if only counted), and [m] int32 true counts.
 
-    Of a flat list, `idx` [total] are the sources, and `receivers` [total] the rows; what stands behind the last pair is undefined.
+    In a flat list, `idx` [total] are the sources, and `receivers` [total] the rows; what stands behind the last pair is undefined.
     `required` [] int32 is the length of the longest row, `status` [] int32 the bits of `Status`. `order` [n] int32 are the sources
     as they follow each other in space, if that is asked for; -1 where their numbers do so already.
     """
@@ -94,9 +94,14 @@ class Search(NamedTuple):
         return 0 if self.exclude is None else 1 if self.exclude.codes is None else 2
 
     @property
+    def lattice(self) -> Lattice | None:
+        """The lattice of a periodic space, or one per system."""
+        return None if self.torus is None else self.torus[0]
+
+    @property
     def per_system(self) -> bool:
         """Whether each system of the batch has a box of its own."""
-        return self.torus is not None and self.torus[0].images.per_system
+        return self.lattice is not None and self.lattice.images.per_system
 
     @property
     def sizes(self) -> tuple[int, int]:
@@ -104,7 +109,7 @@ class Search(NamedTuple):
         return self.sources.shape[0], (self.sources if self.queries is None else self.queries).shape[0]
 
 
-class Kind(NamedTuple):
+class Features(NamedTuple):
     """The features of a search that not every engine supports."""
 
     periodic: bool = False
@@ -114,7 +119,7 @@ class Kind(NamedTuple):
     excluding: bool = False
 
 
-ANYTHING = Kind()  # a search that every engine supports
+ANYTHING = Features()  # a search that every engine supports
 
 
 class Engine(Protocol):
@@ -124,6 +129,7 @@ class Engine(Protocol):
         name: The name that users pass as `backend`.
         static_radius: Whether it has to know the cutoff while tracing.
         translates: Whether it can sum a function over pairs, translated to native code.
+        native: Whether compiled kernels serve the lists that it has found, and renew them: its searches are in the cells of CUDA.
         by_cells: Whether array programs that run in its place find candidates by cells instead of testing all sources.
     """
 
@@ -134,9 +140,11 @@ class Engine(Protocol):
     @property
     def translates(self) -> bool: ...
     @property
+    def native(self) -> bool: ...
+    @property
     def by_cells(self) -> bool: ...
 
-    def refuse(self, kind: Kind) -> str | None:
+    def refuse(self, asked: Features) -> str | None:
         """Return why it cannot run such a search, or None if it can."""
         ...
 

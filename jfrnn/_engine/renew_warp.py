@@ -1,6 +1,6 @@
 """Lists with a skin on CUDA that renew themselves where they are stale: one call, which tells the host nothing.
 
-The device decides (`kernels/native/launch.h`): kernels say whether a point has moved too far, and what is launched behind them, a
+The device decides (`native/launch/launch.h`): kernels say whether a point has moved too far, and what is launched behind them, a
 search and what stands around it, runs if one has.
 """
 
@@ -17,8 +17,8 @@ from jfrnn._engine.launch import Call, Shapes, kernel
 from jfrnn._engine.operands import MOST_IN_BOX, lattice_numbers
 from jfrnn._engine.plans import Launch, Plan
 from jfrnn._engine.problem import Inputs, Options
-from jfrnn._engine.variants import Variant, describe_call
-from jfrnn._engine.warp import PLATFORMS, WarpEngine, all_meet, plan_few, plan_on_cuda
+from jfrnn._engine.variants import describe_call
+from jfrnn._engine.warp import PLATFORMS, all_meet, plan_few, plan_on_cuda
 from jfrnn._geometry import (
     FAR,
     FAR_BITS,
@@ -33,7 +33,7 @@ from jfrnn._geometry import (
     is_valid,
     make_lattice,
 )
-from jfrnn.kernels import cells_cuda, few_cuda, renew
+from jfrnn.kernels import Kind, cells_cuda, few_cuda, renew
 
 _BITS = {"NOT_FINITE": Status.NONFINITE, "OUT_OF_RANGE": Status.OUT_OF_RANGE, "BOX_TOO_SMALL": Status.BOX_TOO_SMALL}
 _FAR = {"FAR": FAR, "FAR_STEP": FAR_STEP, "LARGEST_TURN": LARGEST_TURN, "MET_NOT_FINITE": NOT_FINITE, "MET_TOO_FAR": TOO_FAR}
@@ -67,7 +67,7 @@ def can_renew(inputs: Inputs, options: Options, capacity: int) -> bool:
     if PLATFORMS.get(platform_of(inputs.sources)) != "cuda":
         return False
     images, cutoff = options.images, inputs.cutoff
-    plain = isinstance(options.engine, WarpEngine) and isinstance(cutoff, Cutoff) and not cutoff.scaled
+    plain = options.engine.native and isinstance(cutoff, Cutoff) and not cutoff.scaled
     alone = all(x is None for x in (inputs.queries, inputs.active, inputs.batch, inputs.exclude))
     boxed = images is None or (images.nearest and images.orthogonal and not images.counts_short and not images.per_system)
     n = inputs.sources.shape[0]
@@ -100,7 +100,8 @@ def renew_list(inputs: Inputs, options: Options, kept: KeptRows, limit: np.float
     now, box, cutoff, ordered = inputs.sources, inputs.box, _one_cutoff(inputs), kept.order is not None
     (n, dim), dtype = now.shape, np.dtype(now.dtype)
     few, blocks = all_meet((n, n), False), renew.blocks(n)
-    variant = Variant(dim, dtype == np.float64, False, True, True, cutoff.closed, options.filter, int(box is not None))
+    flags = (True, cutoff.closed, options.filter.drop_self, options.filter.later_only)  # own, closed, drop_self and later
+    variant = Kind(dim, dtype == np.float64, False, *flags, lists=True, periodic=int(box is not None))
     written: dict[str, Any] = dict(zip(_KEPT, kept[: len(_KEPT)], strict=True))
     made: dict[str, int | tuple[int, ...]] = {}
     operands = [now, jnp.full(1, limit, dtype)]
@@ -129,7 +130,7 @@ def _one_cutoff(inputs: Inputs) -> Cutoff:
 
 
 @kernel
-def _renew_callable(variant: Variant, few: bool, ordered: bool) -> Call:
+def _renew_callable(variant: Kind, few: bool, ordered: bool) -> Call:
     boxed, real = variant.periodic > 0, np.float64 if variant.double else np.float32
     floats = ["reference", *_KEPT_OF_BOX * boxed, *["positions", "cutoff"] * boxed]
     kept = [*_KEPT, *_KEPT_OF_BOX * boxed, *["order"] * ordered]
@@ -142,7 +143,7 @@ def _renew_callable(variant: Variant, few: bool, ordered: bool) -> Call:
     return Call(search.name, [*given, *before.values()], types, plan, before)
 
 
-def _plan(variant: Variant, few: bool, ordered: bool, shapes: Shapes, multiprocessors: int) -> Plan:
+def _plan(variant: Kind, few: bool, ordered: bool, shapes: Shapes, multiprocessors: int) -> Plan:
     """Return what says whether the list is stale, and what is launched then."""
     n, boxed = shapes["now"][0], variant.periodic > 0
     same = {"count": "counts"} | ({"queries": "positions"} if boxed else {"positions": "now", "queries": "now"})

@@ -8,19 +8,39 @@ from jax import Array, lax
 
 from jfrnn._engine.operands import as_integer
 from jfrnn._geometry import compensated_sum, rounded_sum
+from jfrnn.kernels import Kind
 from jfrnn.kernels.pair_sum_cpu import TermText
 
 FoundSums = tuple[tuple[Array, ...], Array, Array]  # what `pair_sums` returns
+
+
+class Summed(NamedTuple):
+    """A term that is summed, and how; static.
+
+    Attributes:
+        term: Its text.
+        key: Tells it from all others in names.
+        compensated: Whether rounding errors of sums are added up, too.
+        extremes: Whether the largest summands are found in place of sums.
+    """
+
+    term: TermText
+    key: str
+    compensated: bool = False
+    extremes: bool = False
+
+    def of(self, kind: Kind) -> Kind:
+        """Return the kind of sums over the pairs of a search, or of a list."""
+        return kind._replace(later=False, compensated=self.compensated, extremes=self.extremes)
 
 
 class SumsOf(NamedTuple):
     """The results of a kernel that sums a term: for each of `rows` queries, and over all pairs in `slots` partial sums."""
 
     term: TermText
+    kind: Kind
     rows: int
     slots: int
-    compensated: bool
-    extremes: bool
 
     def dims(self) -> dict[str, Any]:
         """Return the shapes of the arrays that the kernel writes."""
@@ -28,13 +48,13 @@ class SumsOf(NamedTuple):
             "sums": (self.rows, max(self.term.first or self._width, 1)),
             "totals": max(2 * self.slots * self._totals, 1),
             "more": (self.rows, self._width - self.term.first) if self.term.first else (1, 1),
-            "errors": max(self.rows * self._width * (2 * self.extremes + self.compensated), 1),
+            "errors": max(self.rows * self._width * (2 * self.kind.extremes + self.kind.compensated), 1),
         }
 
     def unpack(self, sums: Array, parts: Array, rest: Array, more: Array | None = None) -> FoundSums:
         """Return the results of `pair_sums`; partial sums over all pairs are added together with their rounding errors."""
         width, totals = self._width, self._totals
-        which = as_integer(rest).reshape(self.rows, width, 2) if self.extremes else jnp.zeros((self.rows, width, 0), jnp.int32)
+        which = as_integer(rest).reshape(self.rows, width, 2) if self.kind.extremes else jnp.zeros((self.rows, width, 0), jnp.int32)
         found = (sums,) if more is None or not self.term.first else (sums, more)
         return found, _add_parts(parts[: 2 * self.slots * totals].reshape(self.slots, 2, totals)), which
 

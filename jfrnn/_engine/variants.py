@@ -1,72 +1,49 @@
-"""What is static about a call of kernels that list, count or sum, and what follows from that: its name, and its numbers."""
+"""What is static about a call of kernels that list, count or sum (`jfrnn.kernels.Kind`), and what follows: arrays, and numbers."""
 
 import math
-from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from types import MappingProxyType
 
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
 from jfrnn._engine.launch import Call, Shapes
-from jfrnn._engine.operands import space_flags
-from jfrnn._engine.plans import HugePages, Plan, ask_for_huge_pages
-from jfrnn._engine.problem import Filter, Room, Rows
-from jfrnn._geometry import Status
-from jfrnn.kernels._native import EXCLUDED, ORDERS, RULES, TABLE, table_cells
+from jfrnn._engine.operands import periodic_kind
+from jfrnn._engine.plans import HugePages, Launch, Plan, ask_for_huge_pages, share
+from jfrnn._engine.problem import Filter, Room, Rows, Search
+from jfrnn._geometry import Cutoffs, Status
+from jfrnn.kernels import Kind, cells_cpu, tree_cpu
+from jfrnn.kernels._kind import OWN_BOXES, RULES
+from jfrnn.kernels._native import EXCLUDED, ORDERS, TABLE, table_cells
 
+SUMS = ("sums", "totals", "errors", "more")  # what kernels that sum write
 _PARTICLES = ("positions", "queries", "cutoff")  # what kernels of cells are given
 
 
-class Variant(NamedTuple):
-    """All that is static about an engine call, apart from shapes."""
-
-    dim: int
-    double: bool
-    scaled: bool
-    lists: bool
-    own: bool
-    closed: bool
-    keep: Filter
-    periodic: int = 0  # 1: nearest images, 2: images are told apart; two more where the lattice is skewed
-    batched: bool = False
-    excluding: int = 0  # as `Search.excluding`
-    flat: bool = False  # a list whose rows follow each other without gaps
-    rule: str = ""  # by which the cutoff of a pair follows from both, if they differ
-
-
-def excluding_flags(excluding: int) -> dict[str, bool]:
-    """Return the words of a name that tell what queries exclude."""
-    return {"excluding": excluding == 1, "excludingimages": excluding == 2}
+def kind_of_search(search: Search, keep: Filter, capacity: int | Room | None = None) -> Kind:
+    """Return what is static about a search or, without a capacity, a count; sums add what is static about them alone."""
+    cutoff, batched = search.cutoff, OWN_BOXES if search.per_system else int(search.batch is not None)
+    return Kind(
+        search.sources.shape[1],
+        double=search.sources.dtype == jnp.float64,
+        scaled=cutoff.scaled,
+        own=search.queries is None,
+        closed=cutoff.closed,
+        drop_self=keep.drop_self,
+        later=keep.later_only,
+        lists=capacity is not None,
+        flat=isinstance(capacity, Room),
+        periodic=periodic_kind(search.lattice),
+        batched=batched,
+        excluding=search.excluding,
+        rule=cutoff.rule if isinstance(cutoff, Cutoffs) else "",
+    )
 
 
-class SumVariant(NamedTuple):
-    """All that is static about a pair sum, apart from shapes; `key` names the text."""
-
-    dim: int
-    double: bool
-    scaled: bool
-    own: bool
-    closed: bool
-    drop_self: bool
-    periodic: int
-    batched: bool
-    compensated: bool
-    extremes: bool
-    key: str
-    cuda: bool
-    few: bool  # all of them meet
-    excluding: int
-    rule: str = ""
-    tree: bool = False  # on CUDA
-
-    def name(self, of: str) -> str:
-        """Return the name of a call, which tells it from all others."""
-        flags = {"f64": self.double, "f32": not self.double, "scaled": self.scaled, "own": self.own}
-        flags |= {"closed": self.closed, "dropself": self.drop_self, "batched": self.batched, **space_flags(self.periodic)}
-        flags |= {"compensated": self.compensated, "extremes": self.extremes, **excluding_flags(self.excluding)}
-        flags |= {self.rule: bool(self.rule), "tree": self.tree, self.key: bool(self.key)}
-        return "_".join([f"jfrnn_{of}_{self.dim}d", *(flag for flag, on in flags.items() if on)])
+def scalar_of(kind: Kind) -> type:
+    """Return the dtype of positions."""
+    return np.float64 if kind.double else np.float32
 
 
 def names_of_particles(rule: str) -> tuple[str, ...]:
@@ -86,7 +63,7 @@ def names_of_cutoffs(rule: str) -> tuple[str, ...]:
 
 def describe_call(
     name: str,
-    variant: Variant,
+    kind: Kind,
     plan: Callable[[Shapes, int], Plan],
     given: Sequence[str] = _PARTICLES,
     more: Sequence[str] = ("scratch",),
@@ -97,26 +74,35 @@ def describe_call(
     It is `given` arrays of these names, then those of exclusions and of cutoffs that differ, by a function of the rule; it writes
     rows, counts, `info` and `more`.
     """
-    flags = {"f64": variant.double, "f32": not variant.double, "scaled": variant.scaled, "list": variant.lists}
-    flags |= {"flat": variant.flat, **space_flags(variant.periodic), "batched": variant.batched}
-    flags |= {"own": variant.own, "closed": variant.closed, "dropself": variant.keep.drop_self, "later": variant.keep.later_only}
-    flags |= {**excluding_flags(variant.excluding), variant.rule: bool(variant.rule)}
-    whole = "_".join(["jfrnn", name, f"{variant.dim}d", *(flag for flag, on in flags.items() if on)])
-    results = [*["idx"] * variant.lists, *["receivers"] * variant.flat, "count", "info", *more]
-    given = (*given, *EXCLUDED * bool(variant.excluding), *cutoffs(variant.rule), *["starts"] * variant.flat)
-    return Call(whole, given, dict.fromkeys(results, np.int32), plan)
+    results = [*["idx"] * kind.lists, *["receivers"] * kind.flat, "count", "info", *more]
+    given = (*given, *EXCLUDED * bool(kind.excluding), *cutoffs(kind.rule), *["starts"] * kind.flat)
+    return Call(f"jfrnn_{name}_{kind.name}", given, dict.fromkeys(results, np.int32), plan)
 
 
-def plan_numbers(variant: Variant, shapes: Shapes) -> dict[str, int]:
+def describe_sums(
+    name: str,
+    kind: Kind,
+    key: str,
+    plan: Callable[[Shapes, int], Plan],
+    given: Sequence[str],
+    more: Mapping[str, type] = MappingProxyType({}),
+    cutoffs: Callable[[str], tuple[str, ...]] = names_of_particles,
+) -> Call:
+    """Return what XLA calls for sums of a term, which a key tells from others; it writes sums and `more`."""
+    given = (*given, *EXCLUDED * bool(kind.excluding), *cutoffs(kind.rule))
+    return Call(f"jfrnn_{name}_{kind.name}_{key}", given, dict.fromkeys(SUMS, scalar_of(kind)) | dict(more), plan)
+
+
+def plan_numbers(kind: Kind, shapes: Shapes) -> dict[str, int]:
     """Return the numbers that kernels of cells take, by name; of rows without a common length the capacity is 0."""
-    flags = {"closed": variant.closed, "drop_self": variant.keep.drop_self, "later_only": variant.keep.later_only}
-    capacity = shapes["idx"][1] if variant.lists and not variant.flat else 0
-    return size_numbers(shapes, variant.own) | {"capacity": capacity, **flags}
+    capacity = shapes["idx"][1] if kind.lists and not kind.flat else 0
+    flags = {"closed": kind.closed, "drop_self": kind.drop_self, "later_only": kind.later}
+    return size_numbers(shapes, kind.own) | {"capacity": capacity, **flags}
 
 
-def absent(lists: bool, flat: bool) -> list[str]:
+def absent(kind: Kind) -> list[str]:
     """Return the names of arrays that kernels do not touch."""
-    return [*["idx"] * (not lists), *["starts", "receivers"] * (not flat)]
+    return [*["idx"] * (not kind.lists), *["starts", "receivers"] * (not kind.flat)]
 
 
 def row_dims(m: int, capacity: int | Room | None) -> dict[str, int | tuple[int, int | None]]:
@@ -138,10 +124,16 @@ def found_rows(written: Sequence[Array], count: Array, longest: Array, capacity:
     return Rows(**split_rows(written), counts=count, required=longest, status=status)
 
 
-def huge_pages(variant: Variant, shapes: Shapes) -> list[HugePages]:
+def huge_pages(kind: Kind, shapes: Shapes) -> list[HugePages]:
     """Return the requests for what is written of rows, on the CPU."""
-    names = [*["idx"] * variant.lists, *["receivers"] * variant.flat]
+    names = [*["idx"] * kind.lists, *["receivers"] * kind.flat]
     return [step for name in names for step in ask_for_huge_pages(name, 4 * math.prod(shapes[name]))]
+
+
+def sort_on_cpu(kind: Kind, n: int) -> list[Launch]:
+    """Return what sorts sources and queries on the CPU; several threads put the coordinates of many sources in order."""
+    build, gather = (tree_cpu if kind.rule else cells_cpu).sort_kernels(kind)
+    return [Launch(build), *([share(gather, n)] if n >= cells_cpu.MANY else [])]
 
 
 def size_numbers(shapes: Shapes, own: bool) -> dict[str, int]:

@@ -24,31 +24,32 @@ from jfrnn._engine.operands import (
     pack_particles,
     periodic_kind,
 )
-from jfrnn._engine.plans import Clear, HugePages, Launch, Plan, share
-from jfrnn._engine.problem import Engine, Filter, Kind, Options, Room, Rows, Search, largest_radius
+from jfrnn._engine.plans import Clear, Launch, Plan, share
+from jfrnn._engine.problem import Engine, Features, Filter, Options, Room, Rows, Search, largest_radius
 from jfrnn._engine.start import check_warp
 from jfrnn._engine.variants import (
-    Variant,
     absent,
     describe_call,
     huge_pages,
+    kind_of_search,
     names_of_particles,
     names_of_tree,
     plan_numbers,
     row_dims,
+    sort_on_cpu,
     split_rows,
 )
 from jfrnn._geometry import Cutoffs
 from jfrnn._tracing import on_platform
-from jfrnn.kernels import Kernel, _driver, cells_cpu, cells_cuda, few_cuda, tree_cpu, tree_cuda
+from jfrnn.kernels import Kernel, Kind, _driver, cells_cpu, cells_cuda, few_cuda, tree_cpu, tree_cuda
 
 PLATFORMS = {"cpu": "cpu", "gpu": "cuda", "cuda": "cuda"}  # names in JAX, names of branches
 _CELLS = {"cpu": cells_cpu, "cuda": cells_cuda}
 QUERIES_PER_THREAD = 1024  # on the CPU, at least: among 1000, to wake a second thread takes as long as it saves
 
-# Of cutoffs that differ, on CUDA: how many sources within the largest cutoff a query may meet among cells, and how many more for
-# each that is near, before a tree is searched; and how many queries and sources tell. The first two were measured on an H200 for a
-# walker that trees have replaced, and that was slower: where a tree begins to be faster has not been measured.
+# On CUDA, cutoffs that differ are searched in a tree if queries meet more sources than these within the largest cutoff: so many
+# each, and so many more for each source that is near. SAMPLED queries and sources tell. The first two were measured on an H200 for
+# a walker that trees have replaced, and that was slower: where a tree begins to be faster has not been measured.
 MOST_MET, MOST_MORE, SAMPLED = 2000, 8, (1024, 4096)
 Given = Callable[[Search], dict[str, Array]]  # makes what kernels are given besides, by its names
 Found = TypeVar("Found")  # what a search or a sum returns
@@ -61,9 +62,10 @@ class WarpEngine:
     name = "warp"
     static_radius = False
     translates = True
+    native = True
     by_cells = True
 
-    def refuse(self, kind: Kind) -> str | None:
+    def refuse(self, asked: Features) -> str | None:
         """Refuse nothing."""
         return None
 
@@ -78,7 +80,7 @@ class WarpEngine:
         if isinstance(search.cutoff, Cutoffs):
             return self._rows_of_cutoffs(search._replace(checks={}), options.filter, capacity)
 
-        def on(module: ModuleType, make: Callable[[Variant], Any]) -> Callable[[Search], Rows]:
+        def on(module: ModuleType, make: Callable[[Kind], Any]) -> Callable[[Search], Rows]:
             blocks = few_cuda.blocks(search.sizes[1]) if module is few_cuda else None
             order = functools.partial(_order_in, module, search) if options.ordered and isinstance(capacity, int) else None
             return functools.partial(
@@ -92,7 +94,7 @@ class WarpEngine:
     def _rows_of_cutoffs(self, search: Search, keep: Filter, capacity: int | Room | None) -> Rows:
         starts = (capacity.starts,) if isinstance(capacity, Room) else ()
 
-        def by(make: Callable[[Variant], Any], module: ModuleType, given: Given | None = None) -> Callable[..., Rows]:
+        def by(make: Callable[[Kind], Any], module: ModuleType, given: Given | None = None) -> Callable[..., Rows]:
             def call(search: Search, *starts: Array) -> Rows:
                 room = capacity._replace(starts=starts[0]) if isinstance(capacity, Room) else capacity
                 return call_kernels(module.scratch_words, make, search, keep=keep, capacity=room, given=given)
@@ -116,7 +118,7 @@ def has_order(engine: Engine, platform: str, n: int, plain: bool) -> bool:
 
     `plain`: without queries, and with one cutoff.
     """
-    return isinstance(engine, WarpEngine) and PLATFORMS.get(platform) == "cuda" and n > few_cuda.MOST and plain
+    return engine.native and PLATFORMS.get(platform) == "cuda" and n > few_cuda.MOST and plain
 
 
 def by_cells_or_tree(cells: Callable[..., Found], tree: Callable[..., Found], search: Search, *more: tuple[Array, ...]) -> Found:
@@ -164,7 +166,7 @@ def _order_in(module: ModuleType, search: Search, scratch: Array) -> Array:
 
 def are_few(search: Search) -> bool:
     """Say whether particles are so few that on CUDA all of them meet, in one launch."""
-    return periodic_kind(search.torus) <= 1 and all_meet(search.sizes, search.cutoff.scaled)
+    return periodic_kind(search.lattice) <= 1 and all_meet(search.sizes, search.cutoff.scaled)
 
 
 def all_meet(sizes: tuple[int, int], scaled: bool) -> bool:
@@ -196,7 +198,7 @@ def check_platform(name: str, platform: str) -> None:
 
 def call_kernels(
     scratch_words: Callable[..., int],
-    make: Callable[[Variant], Any],
+    make: Callable[[Kind], Any],
     search: Search,
     *,
     keep: Filter,
@@ -210,26 +212,19 @@ def call_kernels(
     With `blocks`, so many tell of their own queries how long rows are, and their status; otherwise one tells of all. `order` finds
     the order of the sources in that scratch, `given` what kernels are given besides.
     """
-    sources, queries, cutoff, batch, torus = search[:5]
-    own, lists, flat = queries is None, capacity is not None, isinstance(capacity, Room)
-    (n, m), dim = search.sizes, sources.shape[1]
-    double = sources.dtype == jnp.float64
-    periodic = periodic_kind(torus)
-    of_particles = cutoffs_of_particles(cutoff) if isinstance(cutoff, Cutoffs) else {}
-    rule, scaled = (cutoff.rule, True) if isinstance(cutoff, Cutoffs) else ("", cutoff.scaled)
-    kind = (periodic, batch is not None, search.excluding, flat, rule)
-    variant = Variant(dim, double, scaled, lists, own, cutoff.closed, keep, *kind)
-    if periodic in (1, 3) and n >= MOST_IN_BOX:
+    kind, (n, m) = kind_of_search(search, keep, capacity), search.sizes
+    of_particles = cutoffs_of_particles(search.cutoff) if isinstance(search.cutoff, Cutoffs) else {}
+    if kind.periodic in (1, 3) and n >= MOST_IN_BOX:
         raise ValueError(
             f"backend='warp' numbers at most {MOST_IN_BOX - 1} positions in a periodic box, got {n}: pass backend='jax'."
         )
-    words = scratch_words(n, m, dim, 2 if double else 1, own)
+    words = scratch_words(n, m, kind.dim, 2 if kind.double else 1, kind.own)
     dims = {**row_dims(m, capacity), "count": m, "info": 2 if blocks is None else (blocks, 2), "scratch": max(words, 1)}
     more = {} if given is None else given(search)
     operands = [*pack_particles(search), *excluded_rows(search), *of_particles.values(), *more.values()]
     if isinstance(capacity, Room):
         operands.append(capacity.starts)
-    *written, count, info, scratch = make(variant)(*operands, output_dims=dims)
+    *written, count, info, scratch = make(kind)(*operands, output_dims=dims)
     longest, status = (
         (info[0], info[1]) if blocks is None else (info[:, 0].max(), lax.reduce(info[:, 1], np.int32(0), lax.bitwise_or, (0,)))
     )
@@ -238,51 +233,41 @@ def call_kernels(
 
 
 @kernel
-def _cpu_callable(variant: Variant) -> Call:
-    return describe_call("cells_cpu", variant, functools.partial(_plan_on_cpu, variant))
+def _cpu_callable(kind: Kind) -> Call:
+    return describe_call("cells_cpu", kind, functools.partial(_plan_on_cpu, kind))
 
 
 @kernel
-def _tree_callable(variant: Variant) -> Call:
-    return describe_call("tree_cpu", variant, functools.partial(_plan_tree, variant), cutoffs=names_of_particles)
+def _tree_callable(kind: Kind) -> Call:
+    return describe_call("tree_cpu", kind, functools.partial(_plan_on_cpu, kind), cutoffs=names_of_particles)
 
 
 @kernel
-def _cuda_callable(variant: Variant) -> Call:
-    return describe_call("cells_cuda", variant, functools.partial(plan_on_cuda, variant), cutoffs=names_of_particles)
+def _cuda_callable(kind: Kind) -> Call:
+    return describe_call("cells_cuda", kind, functools.partial(plan_on_cuda, kind), cutoffs=names_of_particles)
 
 
 @kernel
-def _tree_on_cuda(variant: Variant) -> Call:
-    return describe_call("tree_cuda", variant, functools.partial(_plan_tree_on_cuda, variant), cutoffs=names_of_tree)
+def _tree_on_cuda(kind: Kind) -> Call:
+    return describe_call("tree_cuda", kind, functools.partial(_plan_tree_on_cuda, kind), cutoffs=names_of_tree)
 
 
 @kernel
-def _few_callable(variant: Variant) -> Call:
-    return describe_call("few_cuda", variant, functools.partial(plan_few, variant))
+def _few_callable(kind: Kind) -> Call:
+    return describe_call("few_cuda", kind, functools.partial(plan_few, kind))
 
 
-def plan_on_cuda(variant: Variant, shapes: Shapes, multiprocessors: int) -> Plan:
+def plan_on_cuda(kind: Kind, shapes: Shapes, multiprocessors: int) -> Plan:
     """Return what is launched for a search among cells."""
-    kind = {"periodic": variant.periodic, "batched": variant.batched, "excluding": variant.excluding, "flat": variant.flat}
-    kind |= {"rule": variant.rule}
-    dim, later = variant.dim, variant.keep.later_only
-    kernels = cells_cuda.cell_kernels(dim, variant.double, variant.scaled, variant.lists, later, **kind)
-    numbers = plan_numbers(variant, shapes)
-    return Plan(
-        place_launches(kernels.launches(numbers["n"], numbers["m"], variant.own, multiprocessors)),
-        numbers,
-        absent(variant.lists, variant.flat),
-    )
+    numbers = plan_numbers(kind, shapes)
+    launches = cells_cuda.cell_kernels(kind).launches(numbers["n"], numbers["m"], kind.own, multiprocessors)
+    return Plan(place_launches(launches), numbers, absent(kind))
 
 
-def _plan_tree_on_cuda(variant: Variant, shapes: Shapes, _: int) -> Plan:
-    kind, space = (variant.dim, variant.double, variant.rule), {"periodic": variant.periodic, "batched": variant.batched}
-    numbers = plan_numbers(variant, shapes)
-    more = {"later": variant.keep.later_only, "excluding": variant.excluding, "flat": variant.flat}
-    query = tree_cuda.query_kernel(*kind, variant.lists, **space, **more)
-    walk = Launch(query, tree_cuda.walk_threads(numbers["m"]), {"of_queries": 0})
-    return Plan([*fit_tree(tree_cuda.fit_kernel(*kind, **space), numbers), walk], numbers, absent(variant.lists, variant.flat))
+def _plan_tree_on_cuda(kind: Kind, shapes: Shapes, _: int) -> Plan:
+    numbers = plan_numbers(kind, shapes)
+    walk = Launch(tree_cuda.query_kernel(kind), tree_cuda.walk_threads(numbers["m"]), {"of_queries": 0})
+    return Plan([*fit_tree(tree_cuda.fit_kernel(kind), numbers), walk], numbers, absent(kind))
 
 
 def fit_tree(fit: Kernel, numbers: Mapping[str, int]) -> list[Clear | Launch]:
@@ -292,21 +277,12 @@ def fit_tree(fit: Kernel, numbers: Mapping[str, int]) -> list[Clear | Launch]:
     return [*clear, *(Launch(fit, each, {"level": level}) for level, each in enumerate(threads))]
 
 
-def plan_few(variant: Variant, shapes: Shapes, _: int) -> Plan:
+def plan_few(kind: Kind, shapes: Shapes, _: int) -> Plan:
     """Return what is launched for a search in which all particles meet."""
-    numbers = plan_numbers(variant, shapes)
-    numbers["drop_self"] &= variant.own
-    query = few_cuda.rows_kernel(
-        few_cuda.warps(numbers["m"]),
-        variant.dim,
-        variant.double,
-        variant.lists,
-        variant.batched,
-        variant.periodic == 1,
-        variant.excluding,
-        variant.flat,
-    )
-    return Plan([Launch(query, few_cuda.threads(numbers["m"]))], numbers, absent(variant.lists, variant.flat))
+    numbers = plan_numbers(kind, shapes)
+    numbers["drop_self"] &= kind.own
+    query = few_cuda.rows_kernel(kind, few_cuda.warps(numbers["m"]))
+    return Plan([Launch(query, few_cuda.threads(numbers["m"]))], numbers, absent(kind))
 
 
 def place_launches(launches: Sequence[cells_cuda.Launch]) -> list[Launch]:
@@ -314,32 +290,8 @@ def place_launches(launches: Sequence[cells_cuda.Launch]) -> list[Launch]:
     return [Launch(x.kernel, x.threads, {"of_queries": int(x.of_queries)}, x.beside) for x in launches]
 
 
-def _plan_on_cpu(variant: Variant, shapes: Shapes, _: int) -> Plan:
-    kind = variant.dim, variant.double, variant.scaled
-    space = {"periodic": variant.periodic, "batched": variant.batched}
-    query = cells_cpu.query_kernel(*kind, variant.lists, **space, excluding=variant.excluding, flat=variant.flat)
-    numbers = plan_numbers(variant, shapes)
-    steps = [
-        *sort_on_cpu(cells_cpu.sort_kernels(*kind, **space), numbers["n"]),
-        *huge_pages(variant, shapes),
-        share(query, numbers["m"], QUERIES_PER_THREAD),
-    ]
-    return Plan(steps, numbers, absent(variant.lists, variant.flat))
-
-
-def _plan_tree(variant: Variant, shapes: Shapes, _: int) -> Plan:
-    kind, space = (variant.dim, variant.double, variant.rule), {"periodic": variant.periodic, "batched": variant.batched}
-    query = tree_cpu.query_kernel(*kind, variant.lists, **space, excluding=variant.excluding, flat=variant.flat)
-    numbers = plan_numbers(variant, shapes)
-    steps = [
-        *sort_on_cpu(tree_cpu.sort_kernels(*kind, **space), numbers["n"]),
-        *huge_pages(variant, shapes),
-        share(query, numbers["m"], QUERIES_PER_THREAD),
-    ]
-    return Plan(steps, numbers, absent(variant.lists, variant.flat))
-
-
-def sort_on_cpu(sort: tuple[Kernel, Kernel], n: int) -> list[Launch | HugePages]:
-    """Return what sorts sources and queries by cell; several threads put the coordinates of many sources in order."""
-    build, gather = sort
-    return [Launch(build), *([share(gather, n)] if n >= cells_cpu.MANY else [])]
+def _plan_on_cpu(kind: Kind, shapes: Shapes, _: int) -> Plan:
+    """Return what is launched on the CPU: among cells or, where cutoffs differ, in a tree."""
+    numbers, query = plan_numbers(kind, shapes), (tree_cpu if kind.rule else cells_cpu).query_kernel(kind)
+    steps = [*sort_on_cpu(kind, numbers["n"]), *huge_pages(kind, shapes), share(query, numbers["m"], QUERIES_PER_THREAD)]
+    return Plan(steps, numbers, absent(kind))

@@ -28,13 +28,13 @@ class Box:
             per system of a batch, shape [systems, d] or [systems, d, d].
         origin: A corner of the cell [length], shape [d]; with `per_system` [systems, d].
         flags: Whether each axis of each system is periodic, shape [systems, d], bool; None: `periodic` says it for all.
-        numbers: Of systems with vectors far longer than need be: how many of each vector make up the short ones in which the search
-            works, whole floats, shape [systems, d, d]; None: the vectors are used as they are given.
+        numbers: How many of each vector make up the short ones in which the search works, whole floats, shape [systems, d, d],
+            where systems have vectors far longer than need be; None: the vectors are used as they are given.
         periodic: Whether each axis is periodic; all True if `flags` tell. Static.
         images: How many cells away a periodic image may lie and still be a neighbor, per axis; None: see `Box`. Static.
         per_system: Whether each system of a batch has a box of its own. Static.
         fractional: Whether positions count the lattice vectors. Static.
-        images_of_list: Of the box of a list (`nbrs.box`): the images of the list, which count where the vectors are traced. Static.
+        images_of_list: The images of the list whose box this is (`nbrs.box`), which count where the vectors are traced. Static.
 
     >>> import jax.numpy as jnp, jfrnn
     >>> nbrs = jfrnn.search(jnp.array([[0.1, 0.5], [0.9, 0.5]]), 0.3, box=jfrnn.Box([1.0, 1.0]))

@@ -143,7 +143,7 @@ def box_runs(
     Args:
         cells: The cells; `from_cell` and `visited` are in the order of the places.
         systems: [m] systems, likewise.
-        lattice: Of all systems.
+        lattice: The lattice of each system.
         places: [b] places of queries.
         which: [] the number of the pass.
         width: Runs of a pass.

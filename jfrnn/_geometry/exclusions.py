@@ -48,7 +48,7 @@ class ExcludedRows(NamedTuple):
 
     @property
     def row_of_each(self) -> Array:
-        """Of which row each of `others` is, [k] int32; behind the last row their number."""
+        """The row of each of `others`, [k] int32; behind the last row the number of rows."""
         place = jnp.arange(self.others.shape[0], dtype=jnp.int32)
         return jnp.searchsorted(self.starts, place, side="right").astype(jnp.int32) - 1
 
@@ -113,7 +113,7 @@ def _make_rows(xp: _ArrayModule, pairs: Given, sources: int, queries: int | None
 
 
 def _narrow(xp: _ArrayModule, shifts: Given) -> Given:
-    """Return shifts as int32; one that does not fit is of an image that is nobody's neighbor, as are all so far away."""
+    """Return shifts as int32; one that does not fit belongs to an image too far away to be a neighbor."""
     most = np.iinfo(np.int32).max // 4
     return xp.clip(
         shifts,

@@ -1,8 +1,8 @@
 """Particles far from a periodic box: moved near it by whole numbers of lattice vectors, without rounding.
 
-Coordinates that nobody wraps, as those of a long molecular run, lie any number of boxes away. Kernels number the lattice vectors
-between a particle and its box by few bits, and the errors of wrapped coordinates grow with that number. So a particle that is at
-least `FAR` vectors away is first moved by a multiple of `FAR_STEP` of them, to coordinates that are floats again.
+Coordinates that are never wrapped, as those of a long molecular run, lie any number of boxes away. Kernels number the lattice
+vectors between a particle and its box by few bits, and the errors of wrapped coordinates grow with that number. So a particle that
+is at least `FAR` vectors away is first moved by a multiple of `FAR_STEP` of them, to coordinates that are floats again.
 
 Why nothing is rounded where vectors lie along the axes: let A be a length in [1, 2), p the exponent of x, and s·256·A what is
 subtracted, with s = round(x / 256 A). A is the sum of two halves of its mantissa, so that both products are exact. In float32,

@@ -11,10 +11,11 @@ from jax import Array
 
 from jfrnn._engine import Inputs, Options, count_few, count_rows
 from jfrnn._geometry import Box, NeighborOverflowError, Status, names_of_bits, shape_of, tell
-from jfrnn._search.edges import Edges, Ends, Graph, close_edges, edges_of, edges_of_rows, make_graph, no_edges
+from jfrnn._search.edges import Edges, Graph, close_edges, edges_of, edges_of_rows, make_graph, no_edges
 from jfrnn._search.exports import MOST_PAIRS
 from jfrnn._search.kept_search import KeptSearch
 from jfrnn._search.making import find_flat_fields
+from jfrnn._search.present import Present
 from jfrnn._search.reverse import Reverse
 from jfrnn._search.topology import Topology
 from jfrnn._tracing import Points, Real, at_once, own_transfers
@@ -112,9 +113,7 @@ class EdgeList(KeptSearch):
         with own_transfers():
             if 0 in (sources.shape[0], len(rows), self.total):
                 return no_edges(jnp.zeros((len(rows), 1), bool), self.source_count, sources, self.status, self.total)
-            kind, cutoff = self.box_kind if box is not None else None, self._cutoff_of_pairs() if self.skin else None
-            where = sources, rows, box, self.batch
-            return edges_of(self._ends(), self.status, self._images_made(), where, cutoff, kind, self.closed, self.half)
+            return edges_of(*self._sides(sources, rows, box, decided=not self.skin), self.status)
 
     def to_jraph(self, positions: Points, box: Box | None = None) -> Graph:
         """Return the edges as a graph of jraph, as `NeighborList.to_jraph` does; jraph need not be installed.
@@ -154,21 +153,21 @@ class EdgeList(KeptSearch):
         self._check_known(spared=self._harmless)
         if 0 in (len(sources), len(rows), self.total):
             return jnp.zeros(self.total, bool), None
-        kind, where = self.box_kind if box is not None else None, (sources, rows, box, self.batch)
-        return close_edges(self._ends(), self._images_made(), where, self._cutoff_of_pairs(), kind, self.closed, self.half)
+        return close_edges(*self._sides(sources, rows, box))
 
-    def _ends(self) -> Ends:
+    def _sides(self, sources: Array, rows: Array, box: Box | None, decided: bool = False) -> tuple[Present, Topology]:
+        """Return the list at these positions, by its senders, and its receivers; `decided` as in `_present`."""
         codes = None if self.images is None else self.images.codes
         by_sender = self._side(self.senders, codes, self.reverse, self.source_count)
         by_receiver = self._side(self.receivers, None, edges_of_rows(self.offsets, self.total), self._row_count)
-        return by_sender, by_receiver, self.offsets[-1]
+        return self._present(by_sender, self.offsets[-1], sources, rows, box, decided), by_receiver
 
     def _side(self, named: Array, codes: Array | None, reverse: Reverse | None, points: int) -> Topology:
         """Return the particles at one end of the edges, as a list of one slot per edge."""
         kind = self.problem.options
         images = 1 if codes is None or kind.images is None else kind.images.total
         codes = None if codes is None else codes[:, None]
-        return Topology(named[:, None], codes, reverse, None, points, images, False, kind.engine.translates)
+        return Topology(named[:, None], codes, reverse, None, points, images, False, kind.engine.native)
 
     def _check_single(self) -> None:
         if self.senders.ndim != 1:

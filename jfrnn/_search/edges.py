@@ -10,10 +10,7 @@ from jax import Array, lax
 
 from jfrnn._engine import flatten_slots
 from jfrnn._geometry import (
-    Batch,
-    Box,
-    Cutoff,
-    Images,
+    Lattice,
     Radii,
     Shifted,
     Status,
@@ -26,7 +23,8 @@ from jfrnn._geometry import (
     translation,
 )
 from jfrnn._search.exports import flat_pairs, row_offsets
-from jfrnn._search.geometry import ImagesMade, edge_shifts, find_ends, lattice_of_rows, norms, pair_cutoff
+from jfrnn._search.geometry import edge_shifts, ends_of, lattice_of_rows, norms
+from jfrnn._search.present import Present
 from jfrnn._search.reverse import Reverse
 from jfrnn._search.topology import Topology
 from jfrnn._search.triplets import Triplets, triplets_of
@@ -156,27 +154,16 @@ def flat_pairs_of(idx: Array, mask: Array, sources: int, total: int, native: boo
     return flat.rows, jnp.where(flat.rows < len(idx), idx.reshape(-1)[flat.slots], sources), flat.offsets, flat.offsets[-1]
 
 
-@functools.partial(compile_program, static_argnames=("kind", "total"))
-def flat_edges(
-    topology: Topology,
-    status: Array,
-    mask: Array,
-    shifts: Array | None,
-    sources: Array,
-    rows: Array,
-    box: Box | None,
-    batch: Batch | None,
-    kind: Images | None,
-    total: int,
-) -> Edges:
-    """Return the edges of a list whose mask [m, capacity] and shifts [m, capacity, d], whole floats or None, are known."""
+@functools.partial(compile_program, static_argnames="total")
+def flat_edges(present: Present, status: Array, mask: Array, shifts: Array | None, total: int) -> Edges:
+    """Return the edges of a list whose mask [m, capacity] and, in a box, shifts [m, capacity, d], whole floats, are known."""
     from jfrnn._search.gathers import gather
 
+    topology, sources, rows, near = present.topology, present.sources, present.rows, ends_of(present)
     (m, capacity), dim = topology.idx.shape, sources.shape[1]
     flat = flatten(mask, total, topology.native)
-    real, near = flat.rows < m, None
-    if shifts is not None and box is not None and kind is not None:
-        near = find_ends(sources, rows, box, kind, batch, topology.native)
+    real = flat.rows < m
+    if near is not None:
         sources, rows = near.sources.points, near.rows.points
     senders = jnp.where(real, topology.idx.reshape(-1)[flat.slots], topology.sources)
     ends = _by_sender(topology, flat.edges, total), _by_row(flat.offsets, capacity, total, topology.native)
@@ -185,10 +172,9 @@ def flat_edges(
         for points, named, end in zip((sources, rows), (senders, flat.rows), ends, strict=True)
     ]
     displacement, shift = sides[0] - sides[1], jnp.zeros((total, dim), jnp.int32)
-    if near is not None and shifts is not None and box is not None and kind is not None:
+    if near is not None and shifts is not None:
         whole = jnp.where(real[:, None], shifts.reshape(-1, dim)[flat.slots], 0)
-        systems = None if batch is None else batch.of_queries.at[flat.rows].get(mode="clip")
-        lattice = lattice_of_rows(box, kind, np.dtype(sources.dtype), systems, topology.native)
+        lattice = _lattice_of_edges(present, flat.rows)
         displacement = displacement + translation(whole, lattice)
         shift = near._replace(of_rows=lattice).shifts_of_given(whole, senders, flat.rows)
         shift = jnp.where(real[:, None], shift, 0)
@@ -199,8 +185,12 @@ def flat_edges(
     return Edges(senders, flat.rows, displacement, shift, real, status, distance, flat.offsets[-1])
 
 
-Ends = tuple[Topology, Topology, Array]  # senders, receivers, and the number of pairs, true or missing some
-Where = tuple[Array, Array, Box | None, Batch | None]  # sources, rows, the box and the systems
+def _lattice_of_edges(present: Present, receivers: Array) -> Lattice:
+    """Return the lattice of a box, or that of each edge."""
+    if present.box is None or present.kind is None:
+        raise TypeError("a list in open space has no lattice.")
+    systems = None if present.batch is None else present.batch.of_queries.at[receivers].get(mode="clip")
+    return lattice_of_rows(present.box, present.kind, np.dtype(present.sources.dtype), systems, present.topology.native)
 
 
 class _EdgePairs(NamedTuple):
@@ -219,77 +209,55 @@ class _EdgePairs(NamedTuple):
     shift: Array
 
 
-@functools.partial(compile_program, static_argnames=("kind", "closed", "half"))
-def edges_of(
-    ends: Ends,
-    status: Array,
-    images: ImagesMade,
-    where: Where,
-    cutoff: Cutoff | Radii | None,
-    kind: Images | None,
-    closed: bool,
-    half: bool,
-) -> Edges:
+@compile_program
+def edges_of(present: Present, by_receiver: Topology, status: Array) -> Edges:
     """Return the edges of a flat list; without a cutoff, all of its pairs are edges."""
-    by_sender, by_receiver, pair_count = ends
-    vectors, mask, _, shift = _edge_pairs(ends, images, where, cutoff, kind, closed, half)
-    missing, shift = pair_count > len(mask), jnp.where(mask[:, None], shift, 0)
-    displacement = jnp.where(mask[:, None], vectors[:, 0], 0).astype(where[0].dtype)
+    vectors, mask, _, shift = _edge_pairs(present, by_receiver)
+    missing, shift = present.count > len(mask), jnp.where(mask[:, None], shift, 0)
+    displacement = jnp.where(mask[:, None], vectors[:, 0], 0).astype(present.sources.dtype)
     known = are_whole(status, Status.NONFINITE) & ~missing
     displacement, shift, distance = (mark_rows(x, known) for x in (displacement, shift, norms(displacement)))
     status = status | jnp.where(missing, jnp.int32(Status.TOTAL_OVERFLOW.value), 0)
-    held = pair_count if cutoff is None else jnp.where(missing, pair_count, jnp.sum(mask, dtype=jnp.int32))
-    return Edges(by_sender.idx[:, 0], by_receiver.idx[:, 0], displacement, shift, mask, status, distance, held)
+    held = present.count if present.cutoff is None else jnp.where(missing, present.count, jnp.sum(mask, dtype=jnp.int32))
+    return Edges(present.topology.idx[:, 0], by_receiver.idx[:, 0], displacement, shift, mask, status, distance, held)
 
 
-@functools.partial(compile_program, static_argnames=("kind", "closed", "half"))
-def close_edges(
-    ends: Ends, images: ImagesMade, where: Where, cutoff: Cutoff | Radii | None, kind: Images | None, closed: bool, half: bool
-) -> tuple[Array, Array | None]:
+@compile_program
+def close_edges(present: Present, by_receiver: Topology) -> tuple[Array, Array | None]:
     """Say which edges are pairs [total]; and return their shifts between near points, [total, d] whole floats, in a box."""
-    _, mask, whole, _ = _edge_pairs(ends, images, where, cutoff, kind, closed, half)
+    _, mask, whole, _ = _edge_pairs(present, by_receiver)
     return mask, None if whole is None else whole[:, 0]
 
 
-def _edge_pairs(
-    ends: Ends, images: ImagesMade, where: Where, cutoff: Cutoff | Radii | None, kind: Images | None, closed: bool, half: bool
-) -> _EdgePairs:
+def _edge_pairs(present: Present, by_receiver: Topology) -> _EdgePairs:
     from jfrnn._search.gathers import gather
 
-    (by_sender, by_receiver, pair_count), (sources, rows, box, batch) = ends, where
+    by_sender, sources, rows, near = present.topology, present.sources, present.rows, ends_of(present)
     total, senders, receivers = len(by_sender.idx), by_sender.idx[:, 0], by_receiver.idx[:, 0]
-    mask, near = lax.iota(jnp.int32, total) < pair_count, None
-    if box is not None and kind is not None:
-        near = find_ends(sources, rows, box, kind, batch, by_sender.native)
+    mask = lax.iota(jnp.int32, total) < present.count
+    if near is not None:
         sources, rows = near.sources.points, near.rows.points
     at_senders, at_receivers = gather(sources, by_sender), gather(rows, by_receiver)
     vectors, pairs, whole = at_senders - at_receivers, None, None
     shift = jnp.zeros((total, sources.shape[1]), jnp.int32)
-    if near is not None and box is not None and kind is not None:
-        systems = None if batch is None else batch.of_queries.at[receivers].get(mode="clip")
-        lattice = lattice_of_rows(box, kind, np.dtype(sources.dtype), systems, by_sender.native)
-        whole = edge_shifts(vectors, mask, (by_sender, by_receiver), images, near, lattice)
-        if half and kind.counts_short:  # as in padded lists
+    if near is not None:
+        lattice = _lattice_of_edges(present, receivers)
+        whole = edge_shifts(vectors, mask, present, receivers, near, lattice)
+        if present.forward:  # as in padded lists
             whole = jnp.where((senders == receivers)[:, None, None], forward_shifts(whole, lattice), whole)
         whole = jnp.where(mask[:, None, None], whole, 0)
         pairs = shift_pairs(vectors, whole, lattice)
         vectors, shift = pairs.vectors, near._replace(of_rows=lattice).shifts_of_given(whole[:, 0], senders, receivers)
-    if cutoff is not None:
-        mask = mask & _are_close(by_sender, by_receiver, mask, sources, at_receivers, cutoff, closed, pairs)
+    if present.cutoff is not None:
+        mask = mask & _are_close(present, by_receiver, mask, sources, at_receivers, pairs)
     return _EdgePairs(vectors, mask, whole, shift)
 
 
 def _are_close(
-    by_sender: Topology,
-    by_receiver: Topology,
-    real: Array,
-    sources: Array,
-    at_receivers: Array,
-    given: Cutoff | Radii,
-    closed: bool,
-    pairs: Shifted | None,
+    present: Present, by_receiver: Topology, real: Array, sources: Array, at_receivers: Array, pairs: Shifted | None
 ) -> Array:
     """Say which edges are those of pairs that are closer than the cutoff, exactly, [total] bool."""
+    given, by_sender = present.cutoff, present.topology
     if isinstance(given, Radii) and given.queries is not None:
         given = dataclasses.replace(given, queries=given.queries.at[by_receiver.idx[:, 0]].get(mode="clip"))
     senders, itself = jnp.where(real[:, None], by_sender.idx, 0), None
@@ -299,7 +267,8 @@ def _are_close(
         there = real & (by_sender.idx == by_receiver.idx)[:, 0] & are_finite(fixed[0])
         itself = there if pairs is None else there & (pairs.shifts == 0).all(axis=(1, 2))
         given = dataclasses.replace(given, itself=False)
-    close = call_apart(is_pair_of, *fixed, senders, real[:, None], pair_cutoff(given, closed), pairs)[:, 0]
+    cutoffs = dataclasses.replace(present, cutoff=given).cutoffs
+    close = call_apart(is_pair_of, *fixed, senders, real[:, None], cutoffs, pairs)[:, 0]
     return close if itself is None else close | itself
 
 

@@ -17,7 +17,6 @@ from jfrnn._geometry import (
     ROWS_ARE_WHOLE,
     Batch,
     Box,
-    Cutoff,
     Exclusions,
     Images,
     Radii,
@@ -40,10 +39,11 @@ from jfrnn._geometry import (
 )
 from jfrnn._search.culprits import name_culprits
 from jfrnn._search.fractional import real_points
-from jfrnn._search.geometry import ImageCodes, ImagesMade
 from jfrnn._search.kept_options import KeptOptions
+from jfrnn._search.present import ImageCodes, Present
 from jfrnn._search.problem import Problem
 from jfrnn._search.reverse import Reverse
+from jfrnn._search.topology import Topology
 from jfrnn._search.verlet import Verlet, has_moved_too_far
 from jfrnn._tracing import Flags, Given, Numbers, Points, Real, call_apart, compile_program, on_platform, own_transfers
 
@@ -288,19 +288,26 @@ class KeptSearch(KeptOptions):
         reach = self.problem.reach(radii)
         return grow_images(self.box_kind, (box, self.box), reach, self.dtype, self.source_count, short)
 
-    def _cutoff_of_pairs(self) -> Cutoff | Radii | None:
-        return self.radii if self.cutoff is None else make_cutoff(self.cutoff, self.dtype, self.closed)
-
-    def _images_made(self) -> ImagesMade:
-        made = None if self.images is None or self.verlet is None else (self.verlet.positions, self.verlet.queries)
-        return self.images, made
+    def _present(
+        self, topology: Topology, count: Array, sources: Array, rows: Array, box: Box | None, decided: bool = False
+    ) -> Present:
+        """Return the list at positions that are lengths, in the present box; `decided`: all of its pairs are pairs now."""
+        problem, images, closed, cutoff = self.problem, self.images, self.problem.options.closed, None
+        if not decided:
+            cutoff = self.radii if problem.cutoff is None else make_cutoff(problem.cutoff, problem.dtype, closed)
+        kind, batch, forward = None, None, False
+        if box is not None:
+            kind, batch = problem.options.images, self.batch
+            forward = problem.options.filter.later_only and kind is not None and kind.counts_short
+        made = None if images is None or self.verlet is None else (self.verlet.positions, self.verlet.queries)
+        return Present(topology, count, (images, made), sources, rows, box, batch, cutoff, kind, closed, forward)
 
     def _geometry_inputs(self, positions: Points, queries: Points | None, box: Box | None) -> tuple[Array, Array, Box | None]:
         """Return the present positions of sources and rows, as lengths, and the present box, after checking that they fit."""
         sources, rows = self._check_points(positions, queries)
         box = self._box_now(box, sources)
         asking = rows if self.own_queries else None
-        real, asking = real_points(sources, asking, box, self.batch, self.problem.options.engine.translates)
+        real, asking = real_points(sources, asking, box, self.batch, self.problem.options.engine.native)
         return real, real if asking is None else asking, box
 
     def _check_points(self, positions: Points, queries: Points | None) -> tuple[Array, Array]:
@@ -352,11 +359,13 @@ def _make_again_if_stale(nbrs: Kept, inputs: Inputs) -> Kept:
     now = hide_inactive(sources, take_present(inputs).active)
     moved = has_moved_too_far(nbrs.verlet, now, queries, box, nbrs.box_kind, radii, nbrs.skin, nbrs.batch)
     fixed = {"box": box, "radii": radii, "batch": nbrs.batch, "exclude": nbrs.exclude}
-    nobody = dict.fromkeys(fixed)  # what stays is no state of the loop, so that XLA derives from it once what steps of a scan need
-    state = moved, _replace(nbrs, **nobody)
+    left_out = dict.fromkeys(
+        fixed
+    )  # what stays is no state of the loop, so that XLA derives from it once what steps of a scan need
+    state = moved, _replace(nbrs, **left_out)
 
     def body(state: tuple[Array, Kept]) -> tuple[Array, Kept]:
-        return jnp.zeros_like(state[0]), _replace(_make_again(state[1], inputs), **nobody)
+        return jnp.zeros_like(state[0]), _replace(_make_again(state[1], inputs), **left_out)
 
     # a loop of at most one iteration: XLA updates a loop's carry in place, but copies the results of a branch
     return _replace(lax.while_loop(lambda state: state[0], body, state)[1], **fixed)

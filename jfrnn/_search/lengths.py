@@ -4,6 +4,7 @@ A pair gives the opposite to j of what it gives to i. So derivatives by position
 of its reverse slot. Neither displacements nor what belongs to them is stored.
 """
 
+import dataclasses
 import functools
 from typing import Any, NamedTuple
 
@@ -14,20 +15,12 @@ from jax.custom_derivatives import SymbolicZero
 from jax.extend.core import Primitive
 
 from jfrnn._engine import KeptList, kept_distances, kept_slopes
-from jfrnn._geometry import Box, Cutoff, Images, Radii, bring_near, translation
+from jfrnn._geometry import Box, bring_near, translation
 from jfrnn._search.gathers import bind, collect, define, gather
-from jfrnn._search.geometry import ImagesMade, kept_list, kept_shifts, norms, open_vectors, periodic_vectors
+from jfrnn._search.geometry import kept_list, kept_shifts, norms, vectors_of
+from jfrnn._search.present import Present
 from jfrnn._search.topology import Topology
 from jfrnn._tracing import call_apart, compile_program
-
-
-class _Given(NamedTuple):
-    """A list without positions and box; see `kept_list`."""
-
-    topology: Topology
-    counts: Array
-    images: ImagesMade
-    cutoff: Cutoff | Radii | None
 
 
 class _Lines(NamedTuple):
@@ -38,57 +31,42 @@ class _Lines(NamedTuple):
     distances: Array
 
 
-@functools.partial(compile_program, static_argnames=("kind", "closed"))
-def lengths(
-    topology: Topology,
-    count: Array,
-    images: ImagesMade,
-    sources: Array,
-    box: Box | None,
-    kind: Images | None,
-    cutoff: Cutoff | Radii | None,
-    closed: bool,
-) -> tuple[Array, Array]:
+@compile_program
+def lengths(present: Present) -> tuple[Array, Array]:
     """Return distances [n, capacity] and the mask, as `norms` of the vectors gives them."""
-    return _lengths((kind, closed), sources, box, lax.stop_gradient(_Given(topology, count, images, cutoff)))
+    return _lengths(present.sources, present.box, lax.stop_gradient(present))
 
 
-@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _lengths(how: tuple[Images | None, bool], sources: Array, box: Box | None, given: _Given) -> tuple[Array, Array]:
-    return call_apart(kept_distances, _at(how, sources, box, given))
+@jax.custom_jvp
+def _lengths(sources: Array, box: Box | None, fixed: Present) -> tuple[Array, Array]:
+    return call_apart(kept_distances, kept_list(_at(sources, box, fixed)))
 
 
-def _at(how: tuple[Images | None, bool], sources: Array, box: Box | None, given: _Given) -> KeptList:
-    kind, closed = how
-    topology, counts, images, cutoff = given
-    return kept_list(topology, counts, images, sources, sources, cutoff, closed, box, kind)
+def _at(sources: Array, box: Box | None, fixed: Present) -> Present:
+    return dataclasses.replace(fixed, sources=sources, rows=sources, box=box)
 
 
-def _by_vectors(how: tuple[Images | None, bool], sources: Array, box: Box | None, given: _Given) -> tuple[Array, Array]:
-    (kind, closed), (topology, counts, images, cutoff) = how, given
-    if box is None or kind is None:
-        vectors, mask = open_vectors(topology, counts, sources, sources, cutoff, closed)
-    else:
-        vectors, mask, _ = periodic_vectors(topology, counts, images, sources, sources, box, None, kind, cutoff, closed, False)
+def _by_vectors(present: Present) -> tuple[Array, Array]:
+    vectors, mask, _ = vectors_of(present)
     return norms(vectors), mask
 
 
 @functools.partial(_lengths.defjvp, symbolic_zeros=True)
-def _lengths_jvp(how: tuple[Images | None, bool], primals: tuple, tangents: tuple) -> tuple[Any, Any]:
-    sources, box, given = primals
+def _lengths_jvp(primals: tuple, tangents: tuple) -> tuple[Any, Any]:
+    sources, box, present = primals
     moved, stretched, _ = tangents
     if any(not isinstance(x, SymbolicZero) for x in jax.tree.leaves(stretched)):
         both = (moved, stretched), (sources, box)
         moved, stretched = jax.tree.map(lambda x, at: jnp.zeros_like(at) if isinstance(x, SymbolicZero) else x, *both)
-        (_, mask), (slopes, none) = jax.jvp(lambda x, box: _by_vectors(how, x, box, given), (sources, box), (moved, stretched))
-        return (_lengths(how, sources, box, given)[0], mask), (slopes, none)
-    distances, mask = _lengths(how, sources, box, given)
+        (_, mask), (slopes, none) = jax.jvp(lambda x, box: _by_vectors(_at(x, box, present)), (sources, box), (moved, stretched))
+        return (_lengths(*primals)[0], mask), (slopes, none)
+    distances, mask = _lengths(*primals)
     none = SymbolicZero(jax.typeof(mask).to_tangent_aval())
     if isinstance(moved, SymbolicZero):
         return (distances, mask), (SymbolicZero(jax.typeof(distances)), none)
-    fixed = _at(how, lax.stop_gradient(sources), lax.stop_gradient(box), given)
+    fixed = kept_list(_at(sources, box, present))
     near = sources if fixed.lattice is None else bring_near(sources, fixed.lattice).points
-    lines = _Lines(fixed._replace(sources=near, rows=near), given.topology, distances)
+    lines = _Lines(fixed._replace(sources=near, rows=near), present.topology, distances)
     return (distances, mask), (bind(_along_p, moved, lines), none)
 
 

@@ -127,7 +127,7 @@ class ListExports(KeptSearch):
             self._check_total(total)
             return flat_pairs(self.idx, self.count, self.source_count, total)
         with own_transfers():
-            *made, held = flat_pairs_of(self.idx, near, self.source_count, total, self.problem.options.engine.translates)
+            *made, held = flat_pairs_of(self.idx, near, self.source_count, total, self.problem.options.engine.native)
         check_held(held, total)
         return made[0], made[1], made[2]
 

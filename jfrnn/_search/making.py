@@ -8,7 +8,7 @@ from jax import lax
 
 from jfrnn._engine import Found, Inputs, Options, count_few, count_rows, hide_inactive, list_flat, list_rows, take_present
 from jfrnn._geometry import Radii
-from jfrnn._search.geometry import ImageCodes
+from jfrnn._search.present import ImageCodes
 from jfrnn._search.reverse import find_reverse
 from jfrnn._search.topology import make_topology
 from jfrnn._search.verlet import first_verlet
@@ -56,7 +56,7 @@ def find_flat_fields(inputs: Inputs, options: Options, total: int, moving: bool,
     rows, fields = found.rows, _common_fields(inputs, options, found, moving)
     fields |= {"senders": rows.idx, "receivers": rows.receivers, "offsets": offsets, "reverse": None}
     if reversing and rows.idx is not None:
-        fields["reverse"] = find_reverse(rows.idx[:, None], None, 1, len(inputs.sources), False, options.engine.translates)
+        fields["reverse"] = find_reverse(rows.idx[:, None], None, 1, len(inputs.sources), False, options.engine.native)
     return fields
 
 

@@ -21,9 +21,10 @@ from jfrnn._geometry import (
 )
 from jfrnn._search.edges import Edges, Graph, flat_edges, make_graph, no_edges
 from jfrnn._search.exports import check_held, check_total, pair_total
-from jfrnn._search.geometry import lattice_shifts, norms, open_vectors, periodic_vectors
+from jfrnn._search.geometry import lattice_shifts, norms, vectors_of
 from jfrnn._search.list_exports import ListExports
 from jfrnn._search.making import count_capacity, find_fields, round_capacity
+from jfrnn._search.present import Present
 from jfrnn._search.reverse import MOST_SLOTS
 from jfrnn._search.topology import Topology, make_topology
 from jfrnn._tracing import Points, Real, Size, own_transfers
@@ -138,10 +139,11 @@ class NeighborList(ListExports):
         with own_transfers():
             if box is None or self.box_kind is None or 0 in (sources.shape[0], *self.idx.shape):
                 return self._mark(jnp.zeros((*self.idx.shape, sources.shape[1]), jnp.int32))
-            given = self._topology(), self.count, self._images_made(), sources, rows, box, self.batch, self.box_kind
-            if self.idx.size <= _FEW_SLOTS:  # the program of `vectors`, so that they share one
-                return self._mark(periodic_vectors(*given, self._cutoff_of_pairs(), self.closed, self.half, True)[2])
-            return self._mark(lattice_shifts(*given, self.half))
+            present = self._at(sources, rows, box)
+            # few slots take the program of `vectors`, called in the same way, so that they share one
+            found = vectors_of(present, True)[2] if self.idx.size <= _FEW_SLOTS else lattice_shifts(present)
+            assert found is not None
+            return self._mark(found)
 
     def distances(self, positions: Points, box: Box | None = None, *, queries: Points | None = None) -> tuple[Array, Array]:
         """Compute the distance to every neighbor.
@@ -166,11 +168,10 @@ class NeighborList(ListExports):
             return norms(vectors), mask
         sources, _, box = self._geometry_inputs(positions, queries, box)
         self._check_known(spared=self._harmless)
-        cutoff = self._cutoff_of_pairs()
         from jfrnn._search.lengths import lengths
 
         with own_transfers():
-            made, mask = lengths(topology, self.count, self._images_made(), sources, box, self.box_kind, cutoff, self.closed)
+            made, mask = lengths(self._present(topology, self.count, sources, sources, box))
             return self._mark(made), mask
 
     def edges(
@@ -213,8 +214,7 @@ class NeighborList(ListExports):
             if 0 in (sources.shape[0], *self.idx.shape, total):
                 made = no_edges(mask, self.source_count, sources, self.status, total)
             else:
-                given = self._topology(), self.status, mask, shifts, sources, rows, box, self.batch
-                made = flat_edges(*given, self.box_kind if box is not None else None, total)
+                made = flat_edges(self._at(sources, rows, box), self.status, mask, shifts, total)
         check_held(made.pair_count, total)
         return made
 
@@ -284,18 +284,17 @@ class NeighborList(ListExports):
     ) -> tuple[Array, Array, Array | None]:
         """Return displacements, mask and shifts of sources and rows that are lengths, in the present box.
 
-        Shifts are those of `periodic_vectors`: between near points, or as they are given.
+        Shifts are those of `vectors_of`: between near points, or as they are given.
         """
         self._check_known(spared=self._harmless)
         if 0 in (sources.shape[0], *self.idx.shape):
             with own_transfers():
                 return jnp.zeros((*self.idx.shape, sources.shape[1]), sources.dtype), jnp.zeros(self.idx.shape, bool), None
-        cutoff = self._cutoff_of_pairs()
         with own_transfers():
-            if box is None or self.box_kind is None:
-                return *open_vectors(self._topology(), self.count, sources, rows, cutoff, self.closed), None
-            given = (self.box_kind, cutoff, self.closed, self.half, as_given)
-            return periodic_vectors(self._topology(), self.count, self._images_made(), sources, rows, box, self.batch, *given)
+            return vectors_of(self._at(sources, rows, box), as_given and box is not None)
+
+    def _at(self, sources: Array, rows: Array, box: Box | None) -> Present:
+        return self._present(self._topology(), self.count, sources, rows, box)
 
     def _topology(self) -> Topology:
         problem, codes = self.problem, None if self.images is None else self.images.codes

@@ -1,13 +1,14 @@
 """The problem: the arguments that all public functions share, checked, and the static part that a list keeps."""
 
 import dataclasses
+from typing import NamedTuple
 
 import jax
 import numpy as np
 from jax import Array
 from jax.core import Tracer
 
-from jfrnn._engine import ENGINES, Filter, Inputs, Kind, Options, choose_engine, has_order, parse_backend, platform_of
+from jfrnn._engine import ENGINES, Features, Filter, Inputs, Options, choose_engine, has_order, parse_backend, platform_of
 from jfrnn._geometry import (
     EXCHANGED,
     Batch,
@@ -107,57 +108,52 @@ class Problem:
         return dataclasses.replace(self, options=self.options._replace(images=images))
 
 
-def check_problem(
-    positions: Given,
-    cutoff: Given,
-    queries: Given,
-    box: Given,
-    batch: Given,
-    radius_rule: Given,
-    species: Given,
-    exclude: Given,
-    half: Given,
-    include_self: Given,
-    closed: Given,
-    backend: Given,
-    skin: Given,
-    active: Given,
-) -> tuple["Problem", Inputs]:
-    """Check the arguments that all public functions share; return their static part and the operands."""
-    sources = check_positions("positions", positions)
-    if queries is not None:
-        queries = check_positions("queries", queries, like=sources)
-        for name, value in (("half", half), ("include_self", include_self)):
+class Asked(NamedTuple):
+    """The arguments that all public functions share, as users give them; see `jfrnn.search`."""
+
+    positions: Given
+    cutoff: Given
+    queries: Given = None
+    box: Given = None
+    batch: Given = None
+    radius_rule: Given = "gather"
+    species: Given = None
+    exclude: Given = None
+    half: Given = False
+    include_self: Given = False
+    closed: Given = False
+    backend: Given = "auto"
+    skin: Given = 0.0
+    active: Given = None
+
+
+def check_problem(asked: Asked) -> tuple["Problem", Inputs]:
+    """Check what is asked; return its static part and the operands."""
+    sources, queries = check_positions("positions", asked.positions), None
+    if asked.queries is not None:
+        queries = check_positions("queries", asked.queries, like=sources)
+        for name, value in (("half", asked.half), ("include_self", asked.include_self)):
             if check_flag(name, value):
                 raise ValueError(f"{name}=True pairs particles with themselves or each other: it cannot be used with queries.")
-    active = None if active is None else check_active(active, sources)
-    keep = Filter(drop_self=queries is None and not check_flag("include_self", include_self), later_only=check_flag("half", half))
-    dtype = np.dtype(sources.dtype)
-    closed = check_flag("closed", closed)
-    if species is None:
-        radii = check_radii(cutoff, radius_rule, sources, queries)
-    else:
-        masked = active is not None or (isinstance(box, Box) and box.per_system)
-        radii = check_species(cutoff, species, radius_rule, sources, queries, masked)
-    if radii is not None and queries is None and not keep.drop_self:
-        radii = dataclasses.replace(radii, itself=True)
-    excluded = None if exclude is None else check_exclusions(exclude, sources, queries)
-    if keep.later_only and radii is not None and radii.rule in EXCHANGED:
-        raise ValueError(f"half=True keeps pairs without direction, which radius_rule={radii.rule!r} gives: pass 'either'.")
-    radius = float(check_cutoff(cutoff, dtype).radius) if radii is None else None
+    active, dtype = None if asked.active is None else check_active(asked.active, sources), np.dtype(sources.dtype)
+    drop_self = queries is None and not check_flag("include_self", asked.include_self)
+    keep, closed = Filter(drop_self, later_only=check_flag("half", asked.half)), check_flag("closed", asked.closed)
+    radii = _check_cutoffs(asked, sources, queries, keep)
+    excluded = None if asked.exclude is None else check_exclusions(asked.exclude, sources, queries)
+    radius = float(check_cutoff(asked.cutoff, dtype).radius) if radii is None else None
     largest = radius if radii is None else largest_known(radii)
-    skin = check_skin(skin, largest or 0.0, dtype)
+    skin = check_skin(asked.skin, largest or 0.0, dtype)
     reach = None if largest is None else list_radius(largest, skin, dtype)
-    box = None if box is None else check_box(box, sources)
-    if box is not None and box.per_system:
-        _check_boxes(batch)
+    box = None if asked.box is None else check_box(asked.box, sources)
+    if box is not None and box.per_system and asked.batch is None:
+        raise ValueError("box holds a box per system: pass batch=, the system of each particle (from 0 on; -1: in none of them).")
     images = None if box is None else images_of(box, reach, dtype, sources.shape[0])
-    kind = Kind(periodic=box is not None, radii=radii is not None, batch=batch is not None, excluding=exclude is not None)
-    engine = choose_engine(parse_backend(backend, ENGINES), sources, queries, kind)
-    systems = None if batch is None else check_batch(batch, sources, queries)
+    features = Features(box is not None, asked.batch is not None, radii is not None, excluding=asked.exclude is not None)
+    engine = choose_engine(parse_backend(asked.backend, ENGINES), sources, queries, features)
+    systems = None if asked.batch is None else check_batch(asked.batch, sources, queries)
     ordered = has_order(engine, platform_of(sources), sources.shape[0], queries is None and radii is None)
     static_reach = reach if engine.static_radius else None
-    sources, queries = real_points(sources, queries, box, systems, engine.translates)
+    sources, queries = real_points(sources, queries, box, systems, engine.native)
     options = Options(keep, engine, closed, 0.0 if radii is None else skin, images, static_reach, ordered)
     shape = {"own_queries": queries is not None, "masked": active is not None, "source_count": sources.shape[0]}
     problem = Problem(options, radius, skin, **shape, dim=sources.shape[1], dtype=dtype)
@@ -165,7 +161,14 @@ def check_problem(
     return problem, problem.inputs(sources, queries, active, box, radii, systems, excluded)
 
 
-def _check_boxes(batch: Given) -> None:
-    """Raise if it is not said to which of the systems, of which each has a box, particles belong."""
-    if batch is None:
-        raise ValueError("box holds a box per system: pass batch=, the system of each particle (from 0 on; -1: in none of them).")
+def _check_cutoffs(asked: Asked, sources: Array, queries: Array | None, keep: Filter) -> Radii | None:
+    """Return cutoffs that differ, None with one for all."""
+    if asked.species is None:
+        radii = check_radii(asked.cutoff, asked.radius_rule, sources, queries)
+    else:
+        masked = asked.active is not None or (isinstance(asked.box, Box) and asked.box.per_system)
+        radii = check_species(asked.cutoff, asked.species, asked.radius_rule, sources, queries, masked)
+    if radii is not None and keep.later_only and radii.rule in EXCHANGED:
+        raise ValueError(f"half=True keeps pairs without direction, which radius_rule={radii.rule!r} gives: pass 'either'.")
+    own = queries is None and not keep.drop_self
+    return dataclasses.replace(radii, itself=True) if radii is not None and own else radii

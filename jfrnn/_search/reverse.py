@@ -46,8 +46,8 @@ def find_reverse(idx: Array, codes: Array | None, images: int, sources: int, mut
         native: Whether Warp's kernels run where the list is.
     """
     if 0 in (*idx.shape, sources):
-        nobody = jnp.zeros(sources, jnp.int32)
-        return Reverse(jnp.zeros(idx.shape, jnp.int32)) if mutual else Reverse(jnp.zeros(idx.size, jnp.int32), nobody, nobody)
+        none = jnp.zeros(sources, jnp.int32)
+        return Reverse(jnp.zeros(idx.shape, jnp.int32)) if mutual else Reverse(jnp.zeros(idx.size, jnp.int32), none, none)
     if mutual:
         arrays = functools.partial(_reverse_by_comparing, images=images)
         if not native:

@@ -12,7 +12,7 @@ from jfrnn._search.edge_list import EdgeList, count_total
 from jfrnn._search.exports import check_total
 from jfrnn._search.making import count_capacity, find_fields, find_flat_fields
 from jfrnn._search.neighbor_list import NeighborList
-from jfrnn._search.problem import check_problem
+from jfrnn._search.problem import Asked, check_problem
 from jfrnn._search.reverse import MOST_SLOTS
 from jfrnn._tracing import (
     AnyCutoff,
@@ -91,9 +91,8 @@ def search(
     >>> nbrs.count.tolist(), [indices.tolist() for indices in nbrs.pairs()]
     ([1, 1, 0], [[0, 1], [1, 0]])
     """
-    problem, inputs = check_problem(
-        positions, cutoff, queries, box, batch, radius_rule, species, exclude, half, include_self, closed, backend, skin, active
-    )
+    options = (radius_rule, species, exclude, half, include_self, closed, backend, skin, active)
+    problem, inputs = check_problem(Asked(positions, cutoff, queries, box, batch, *options))
     slack = check_slack(slack)
     if capacity is None:
         _refuse_traced(inputs, "capacity", "capacity=int(jfrnn.count(positions, cutoff + skin).max())")
@@ -167,9 +166,8 @@ def search_edges(
     >>> nbrs.edges(x).distance.tolist()
     [0.5, 0.5, 0.0, 0.0]
     """
-    problem, inputs = check_problem(
-        positions, cutoff, queries, box, batch, radius_rule, species, exclude, half, include_self, closed, backend, skin, active
-    )
+    options = (radius_rule, species, exclude, half, include_self, closed, backend, skin, active)
+    problem, inputs = check_problem(Asked(positions, cutoff, queries, box, batch, *options))
     problem = dataclasses.replace(problem, options=problem.options._replace(ordered=False))
     slack, reverse = check_slack(slack), check_flag("reverse", reverse)
     if total is None:
@@ -215,9 +213,8 @@ def count(
     >>> jfrnn.count(jnp.array([[0.0, 0.0], [0.3, 0.4], [2.0, 0.0]]), 1.0).tolist()
     [1, 1, 0]
     """
-    problem, inputs = check_problem(
-        positions, cutoff, queries, box, batch, radius_rule, species, exclude, half, include_self, closed, backend, 0.0, active
-    )
+    options = (radius_rule, species, exclude, half, include_self, closed, backend, 0.0, active)
+    problem, inputs = check_problem(Asked(positions, cutoff, queries, box, batch, *options))
     with own_transfers():
         counts, _, status = call_apart(lambda inputs: count_rows(inputs, problem.options), inputs)
         known = known_status(status)

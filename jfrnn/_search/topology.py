@@ -84,4 +84,4 @@ def make_topology(
     """Return which sources the slots of a list of a search with these options hold."""
     images = 1 if options.images is None else options.images.total
     mutual = is_mutual(options, own_queries, radii)
-    return Topology(idx, codes, reverse, order, sources, images, mutual, options.engine.translates)
+    return Topology(idx, codes, reverse, order, sources, images, mutual, options.engine.native)

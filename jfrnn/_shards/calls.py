@@ -11,7 +11,7 @@ import numpy as np
 from jax import Array, lax
 from jax.sharding import PartitionSpec
 
-from jfrnn._engine import ENGINES, Kind, parse_backend
+from jfrnn._engine import ENGINES, Features, parse_backend
 from jfrnn._geometry import check_cutoff, check_flag, check_skin, mark_rows
 from jfrnn._search import count, list_radius, round_capacity
 from jfrnn._shards.halo import Halo, exchange, halo_in_shard, halo_spec, rows_seen
@@ -19,7 +19,7 @@ from jfrnn._shards.particles import OVERFLOWS, Particles, of_shards, spec_of
 from jfrnn._tracing import Given, Tree
 
 # The engines that support periodic boxes, which distributed particles may have.
-BACKENDS = {name: engine for name, engine in ENGINES.items() if engine.refuse(Kind(periodic=True)) is None}
+BACKENDS = {name: engine for name, engine in ENGINES.items() if engine.refuse(Features(periodic=True)) is None}
 
 
 class Asked(NamedTuple):

@@ -23,6 +23,7 @@ from jfrnn._engine import (
     KeptList,
     Options,
     Search,
+    Summed,
     as_float,
     kept_sums,
     level_of_caller,
@@ -204,7 +205,9 @@ def sums(inputs: Inputs, options: Options, term: Term, operands: Groups, compens
 def sums_of_list(given: KeptList, term: Term, operands: Groups, compensated: bool, apart: bool) -> list[Array]:
     """Sum a term over the pairs of a list; with `given.reversal` over those of its sources."""
     plan = make_plan(term, *_kind_of_list(given), listed=True)
-    found, totals, _ = kept_sums(given, plan.text, plan.key, _values_of_list(given, plan, term, operands), compensated, apart)
+    found, totals, _ = kept_sums(
+        given, Summed(plan.text, plan.key, compensated), _values_of_list(given, plan, term, operands), apart
+    )
     return _unpack(term, found, totals)
 
 
@@ -212,7 +215,7 @@ def extremes_of_list(given: KeptList, term: Term, operands: Groups, largest: boo
     """Find the largest summands over the pairs of a list, as `extremes` does over those of a search."""
     plan = make_plan(term, *_kind_of_list(given), not largest, listed=True)
     values = _values_of_list(given, plan, term, operands)
-    (found,), _, which = kept_sums(given, plan.text, plan.key, values, False, extremes=True)
+    (found,), _, which = kept_sums(given, Summed(plan.text, plan.key, extremes=True), values)
     source, place, shifts = which[..., 0], which[..., 1], None
     if given.lattice is not None:
         codes = None if given.codes is None else jnp.take_along_axis(given.codes, place, axis=1)
@@ -269,7 +272,7 @@ def _launch(search: Search, options: Options, plan: Plan, operands: Groups, comp
     columns = plan.shared, plan.own, plan.others
     shared, own, others = (_pack(*group, sources.dtype) for group in zip(operands, columns, sizes, strict=True))
     values = shared, own, others
-    return pair_sums(search, options.filter, plan.text, plan.key, values, compensated, extremes)
+    return pair_sums(search, options.filter, Summed(plan.text, plan.key, compensated, extremes), values)
 
 
 def _pack(group: tuple, columns: _Columns, size: int | None, dtype: np.dtype) -> Array:

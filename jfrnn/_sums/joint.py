@@ -3,7 +3,7 @@
 Each sum looks for one that stands before it in the same block of operations, over the same pairs, at whose place all of its own
 operands are known, too. One sum with the summands of both then stands there, and what used the results of the first uses those of
 it. What the first left behind has no use, and XLA drops it. Operands that are one number in all rows, such as the ones that the
-gradient of a total multiplies by, become shared, so that nobody writes them down for every particle.
+gradient of a total multiplies by, become shared, so that they are not written for every particle.
 
 No other file reads operations of XLA, whose Python interface is private to JAX and differs between its releases. What is read is
 tried out on a small program before the first sum is lowered. Where anything is not as expected, every sum is lowered alone, which
@@ -122,7 +122,7 @@ def find_fault() -> str | None:
             module = ir.Module.create()
             with ir.InsertionPoint(module.body):
                 return ", ".join(name for name, is_right in _try_out().items() if not is_right) or None
-    except Exception as error:  # of whatever kind: nobody promises anything of this interface
+    except Exception as error:  # of whatever kind: this interface is not a promise
         return f"{type(error).__name__}: {error}"
 
 

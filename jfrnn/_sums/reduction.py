@@ -11,13 +11,12 @@ import numpy as np
 from jax import Array, lax
 from jax.core import Tracer
 
-from jfrnn._engine import Inputs, KeptList, Options, find_bits, hide_inactive, rows_asked
+from jfrnn._engine import Inputs, Options, find_bits, hide_inactive, rows_asked
 from jfrnn._geometry import (
     EXCHANGED,
     ROWS_ARE_WHOLE,
     Batch,
     Box,
-    Cutoff,
     Images,
     Lattice,
     Radii,
@@ -26,13 +25,12 @@ from jfrnn._geometry import (
     check_cutoff,
     good_rows,
     known_status,
-    make_cutoff,
     make_cutoffs,
     mark_rows,
     one_or_nan,
     translation,
 )
-from jfrnn._search import MOST_SLOTS, EdgeList, NeighborList, Problem, find_ends, is_native, kept_list, lattice_of_rows
+from jfrnn._search import MOST_SLOTS, EdgeList, NeighborList, Problem, find_ends, kept_list, lattice_of_rows
 from jfrnn._sums.extremes import bind_extremes
 from jfrnn._sums.pair_function import call_with_pair
 from jfrnn._sums.relations import Flat, Kept, Listed, Relation, Searched
@@ -130,19 +128,12 @@ def _relation_of_list(
         mask, shifts = nbrs._close_edges(sources, rows, box)
         kind = {"source_count": nbrs.source_count, "symmetric": symmetric}
         return Flat(senders=nbrs.senders, receivers=nbrs.receivers, offsets=nbrs.offsets, mask=mask, shifts=shifts, **kind)
-    topology, nobody = nbrs._topology(), 0 in (*nbrs.idx.shape, nbrs.source_count)
-    if nobody or not is_native(topology, nbrs.box_kind, nbrs.half) or nbrs.idx.size > MOST_SLOTS:
+    present, empty = nbrs._at(sources, rows, box), 0 in (*nbrs.idx.shape, nbrs.source_count)
+    if empty or not present.native or nbrs.idx.size > MOST_SLOTS:
         _, mask, shifts = nbrs._geometry_of(sources, rows, box)
         return Listed(idx=nbrs.idx, mask=mask, shifts=shifts, source_count=nbrs.source_count, symmetric=symmetric)
     nbrs._check_known(spared=ROWS_ARE_WHOLE)
-    cutoff = nbrs.radii if nbrs.cutoff is None else make_cutoff(nbrs.cutoff, nbrs.dtype, nbrs.closed)
-    kind = nbrs.box_kind
-
-    def make(nbrs: NeighborList, sources: Array, rows: Array, cutoff: Cutoff | Radii, box: Box | None) -> KeptList:
-        images = nbrs._images_made()
-        return kept_list(nbrs._topology(), nbrs.count, images, sources, rows, cutoff, nbrs.closed, box, kind, nbrs.batch)
-
-    given = call_apart(make, nbrs, sources, rows, cutoff, box)
+    given = call_apart(kept_list, present)
     known = nbrs.reverse if nbrs.reverse is not None and nbrs.reverse.starts is not None else None
     return Kept(given, known, symmetric)
 

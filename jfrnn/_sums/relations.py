@@ -78,7 +78,7 @@ class _OfList:
 
     Attributes:
         mask: Which slots hold a pair, bool.
-        shifts: Of each slot, [..., d] whole floats, or None in open space.
+        shifts: The lattice shift of each slot, [..., d] whole floats, or None in open space.
         source_count: Number of sources. Static.
         symmetric: Whether exchanging i and j gives the same pairs. Static.
         flipped: Whether i and j are exchanged: i are the sources of the list, j its rows, and shifts are negated. Static.

@@ -3,7 +3,7 @@
     translated = translate(jax.make_jaxpr(function)(*examples))
 
 Every array is split into scalars in C order. The text reads `in0_0`, `in0_1`, ... and defines `out0_0`, ...; it calls functions of
-`Math`, defined in `kernels/native/math.h` for scalars on the CPU and on CUDA, and for vectors of lanes on the CPU.
+`Math`, defined in `kernels/native/math/math.h` for scalars on the CPU and on CUDA, and for vectors of lanes on the CPU.
 `jfrnn._sums.primitives` translates the single primitives.
 
 Results agree with JAX up to a few ulp, including NaN and infinities. Every operation is one statement, so the enclosing block

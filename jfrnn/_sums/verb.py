@@ -8,9 +8,9 @@ import jax
 from jax import Array
 from jax.tree_util import KeyPath
 
-from jfrnn._engine import ARRAYS, ENGINES, Inputs, Kind, Options, parse_backend, platform_of
+from jfrnn._engine import ARRAYS, ENGINES, Features, Inputs, Options, parse_backend, platform_of
 from jfrnn._geometry import Box, check_flag
-from jfrnn._search import EdgeList, NeighborList, check_problem
+from jfrnn._search import Asked, EdgeList, NeighborList, check_problem
 from jfrnn._tracing import (
     AnyCutoff,
     Backend,
@@ -104,11 +104,10 @@ def pair_sum(  # noqa: D417 (nine arguments share a line)
     if neighbors is None:
         if cutoff is None:
             raise ValueError("cutoff must be given: only a list (neighbors=) has its own.")
-        if named is not None and (reason := named.refuse(Kind(summed=True))):
+        if named is not None and (reason := named.refuse(Features(summed=True))):
             raise ValueError(f"backend={backend!r} {reason}")
-        problem, inputs = check_problem(
-            positions, cutoff, queries, box, batch, radius_rule, species, exclude, False, include_self, closed, backend, 0.0, active
-        )
+        options = (radius_rule, species, exclude, False, include_self, closed, backend, 0.0, active)
+        problem, inputs = check_problem(Asked(positions, cutoff, queries, box, batch, *options))
         with own_transfers():
             engine = _with_engine(problem.options, inputs, named is None)
             pairs = pairs_of_search(dataclasses.replace(problem, options=engine), inputs, reduce == "sum")

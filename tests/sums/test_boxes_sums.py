@@ -11,7 +11,7 @@ from test_kept_cuda import compiles, term_of
 
 import jfrnn
 from jfrnn.cases.crystals import CRYSTAL_CASES
-from jfrnn.kernels import boxes, kept
+from jfrnn.kernels import Kind, boxes, kept
 
 SLOW = pytest.mark.slow
 fused = functools.partial(jfrnn.pair_sum, backend="warp")
@@ -61,12 +61,13 @@ def test_case(name, listed):
 @SLOW
 @pytest.mark.parametrize(("dim", "double", "periodic"), [(3, False, 4), (2, True, 1)])
 def test_kernels_compile_for_cuda(dim, double, periodic):
-    for kernel in boxes.sorting_kernels(dim, double, periodic):
+    space = Kind(dim, double, periodic=periodic, batched=2)
+    for kernel in boxes.sorting_kernels(space):
         assert compiles(kernel)
     for lists, later in ((False, False), (True, False), (True, True)):
-        assert compiles(boxes.rows_kernel(dim, double, False, lists, later, periodic))
-    kind = kept.ListKind(dim, double, False, periodic, 0, "", False, True, False, 8)
+        assert compiles(boxes.rows_kernel(space._replace(lists=lists, later=later)))
+    term = term_of(kept.ListKind(space, lanes=8))
     for extremes in (False, True):
-        term = term_of(kind)
-        term = term._replace(sums=term.sums[:1]) if extremes else term
-        assert compiles(boxes.sum_kernel(term, f"test_{extremes}", dim, double, False, not extremes, extremes, periodic))
+        asked = term._replace(sums=term.sums[:1]) if extremes else term
+        kind = space._replace(compensated=not extremes, extremes=extremes)
+        assert compiles(boxes.sum_kernel(kind, asked, f"test_{extremes}"))

@@ -12,7 +12,7 @@ import pytest
 
 import jfrnn
 from jfrnn._engine import warp
-from jfrnn.kernels import _compile, cells_cpu, cells_cuda, declare, few_cuda, hashgrid, tree_cuda
+from jfrnn.kernels import Kind, _compile, cells_cpu, cells_cuda, declare, few_cuda, hashgrid, tree_cuda
 from jfrnn.kernels._native import program
 
 VARIANTS = [(dim, double, False, lists, False) for dim, double, lists in itertools.product((2, 3), (False, True), (False, True))]
@@ -48,25 +48,25 @@ def compiles(*kernels):
 
 @pytest.mark.parametrize(("dim", "double", "scaled", "lists", "later"), sparing(VARIANTS, FEW))
 def test_variants_compile(dim, double, scaled, lists, later):
-    assert compiles(*cells_cuda.cell_kernels(dim, double, scaled, lists, later)) == 2
+    assert compiles(*cells_cuda.cell_kernels(Kind(dim, double, scaled=scaled, lists=lists, later=later))) == 2
 
 
 @pytest.mark.parametrize(
     ("dim", "double", "scaled", "lists"), sparing(itertools.product((2, 3), *3 * [(False, True)]), pairwise(4))
 )
 def test_hashgrid_compiles(dim, double, scaled, lists):
-    assert compiles(*hashgrid.search_kernels(dim, double, scaled, lists, cuda=True)) == 1
+    assert compiles(*hashgrid.search_kernels(Kind(dim, double, scaled=scaled, lists=lists), cuda=True)) == 1
 
 
 def test_boxes_batches_and_cutoffs_per_particle_compile():
-    assert compiles(*cells_cuda.cell_kernels(3, False, False, True, periodic=2, batched=True)) == 3
+    assert compiles(*cells_cuda.cell_kernels(Kind(3, False, lists=True, periodic=2, batched=1))) == 3
     for rule, periodic in (("mean", 2), ("gather", 0)):
-        space = {"periodic": periodic, "batched": True}
-        tree = tree_cuda.fit_kernel(3, False, rule, **space), tree_cuda.query_kernel(3, False, rule, True, **space)
-        assert compiles(*tree) == 2
-        assert compiles(*cells_cuda.cell_kernels(3, False, True, True, periodic=periodic, rule=rule)) == (3 if periodic else 2)
+        kind = Kind(3, False, scaled=True, lists=True, periodic=periodic, rule=rule)
+        batched = kind._replace(batched=1)
+        assert compiles(tree_cuda.fit_kernel(batched), tree_cuda.query_kernel(batched)) == 2
+        assert compiles(*cells_cuda.cell_kernels(kind)) == (3 if periodic else 2)
     for rule, double in (("table", False), ("either", False), ("table", True)):
-        assert compiles(*cells_cuda.cell_kernels(2, double, True, False, rule=rule)) == 2
+        assert compiles(*cells_cuda.cell_kernels(Kind(2, double, scaled=True, rule=rule))) == 2
 
 
 def test_cells_serve_where_cutoffs_are_alike_near_most_particles(monkeypatch):
@@ -101,7 +101,8 @@ def test_cells_serve_where_cutoffs_are_alike_near_most_particles(monkeypatch):
     ("dim", "double", "lists", "batched", "boxed"), sparing(itertools.product((2, 3), *4 * [(False, True)]), pairwise(5))
 )
 def test_kernels_of_few_particles_compile(dim, double, lists, batched, boxed):
-    assert compiles(few_cuda.rows_kernel(32 if lists else 16, dim, double, lists, batched, boxed=boxed)) == 1
+    kind = Kind(dim, double, lists=lists, periodic=int(boxed), batched=int(batched))
+    assert compiles(few_cuda.rows_kernel(kind, 32 if lists else 16)) == 1
 
 
 @pytest.mark.parametrize("module", [cells_cpu, cells_cuda], ids=["cpu", "cuda"])
@@ -114,7 +115,7 @@ def test_scratch_is_at_most_64_bytes_per_particle(module, n, dim):
 
 
 def test_queries_that_reach_out_of_a_box_have_a_kernel_of_their_own():
-    kernels = cells_cuda.cell_kernels(3, False, False, True, periodic=1)
+    kernels = cells_cuda.cell_kernels(Kind(3, False, lists=True, periodic=1))
     for own, marks in ((True, 0), (False, 1)):
         launches = kernels.launches(1000, 500, own, 132)
         assert [launch.kernel for launch in launches[-2:]] == [kernels.crossing, kernels.query]
@@ -124,7 +125,7 @@ def test_queries_that_reach_out_of_a_box_have_a_kernel_of_their_own():
 
 
 def test_queries_of_their_own_are_sorted_too():
-    kernels = cells_cuda.cell_kernels(3, False, False, True)
+    kernels = cells_cuda.cell_kernels(Kind(3, False, lists=True))
     own, others = (kernels.launches(1000, 500, own, 132) for own in (True, False))
     assert [launch.of_queries for launch in own] == [False] * 7
     assert [launch.of_queries for launch in others].count(True) == 3
@@ -132,7 +133,7 @@ def test_queries_of_their_own_are_sorted_too():
 
 
 def test_launches_follow_the_device_and_shares_of_queries_do_not():
-    kernels, n = cells_cuda.cell_kernels(3, False, False, True, periodic=1), 10**8
+    kernels, n = cells_cuda.cell_kernels(Kind(3, False, lists=True, periodic=1)), 10**8
     small, large = (kernels.launches(n, n, False, multiprocessors) for multiprocessors in (2, 160))
     for few, many in zip(small, large, strict=True):
         assert few.kernel is many.kernel
@@ -171,7 +172,9 @@ struct Count {
 
 
 def test_kernels_share_queries_as_launches_do():
-    (count,) = declare("shares", program(False, 3, "shares.h", WARPS=cells_cuda.GRID["WARPS"]) + SHARE, "Count.run")
+    (count,) = declare(
+        "shares", program(Kind(3, False), "shares.h", constants={"WARPS": cells_cuda.GRID["WARPS"]}) + SHARE, "Count.run"
+    )
     edges = [cells_cuda.GRID["WARPS"] * 2**bits + k for bits in range(7) for k in (-1, 0, 1)]
     queries = np.array([0, 1, 31, 32, 33, 1000, *edges, 10**6, 2**31 - 1], np.int32)
     found = np.zeros((len(queries), 2), np.int32)

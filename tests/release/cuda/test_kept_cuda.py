@@ -3,17 +3,18 @@
 import pytest
 
 from jfrnn._engine.start import load_warp
-from jfrnn.kernels import _compile, kept, reverse
+from jfrnn.kernels import Kind, _compile, kept, reverse
+from jfrnn.kernels.kept import ListKind
 from jfrnn.kernels.pair_sum_cpu import Step, Sum, TermText, Value
 
 TEXT = "const auto v0 = x * y;\nconst auto o = v0 + s;\n"
 KINDS = [
-    kept.ListKind(3, False, False, 0, 0, "", False, True, False, 1),
-    kept.ListKind(3, False, False, 1, 0, "", False, True, True, 8),
-    kept.ListKind(2, False, True, 1, 0, "mean", False, False, False, 8),
-    kept.ListKind(3, False, False, 2, 1, "", True, True, True, 8, boxes=True),
-    kept.ListKind(3, True, True, 4, 2, "either", False, True, False, 1),
-    kept.ListKind(2, True, False, 3, 0, "", False, True, False, 8),
+    ListKind(Kind(3, False), aligned=True, lanes=1),
+    ListKind(Kind(3, False, periodic=1), aligned=True, ordered=True, lanes=8),
+    ListKind(Kind(2, False, scaled=True, periodic=1, rule="mean"), lanes=8),
+    ListKind(Kind(3, False, periodic=2), code_bytes=1, reversed=True, aligned=True, ordered=True, lanes=8, boxes=True),
+    ListKind(Kind(3, True, scaled=True, periodic=4, rule="either"), code_bytes=2, aligned=True, lanes=1),
+    ListKind(Kind(2, True, periodic=3), aligned=True, lanes=8),
 ]
 
 
@@ -23,9 +24,9 @@ def compiles(kernel):
 
 
 def term_of(kind):
-    dtype = "float64" if kind.double else "float32"
-    steps = (Step("s", 0),) if kind.periodic else ()
-    text = TEXT if kind.periodic else TEXT.replace("+ s", "+ c")
+    dtype = "float64" if kind.kind.double else "float32"
+    steps = (Step("s", 0),) if kind.kind.periodic else ()
+    text = TEXT if kind.kind.periodic else TEXT.replace("+ s", "+ c")
     others = (Value("x", dtype, 1), Value("c", dtype))
     return TermText(text, steps, (), (Value("y", dtype, 0),), others, (Sum("o", False, False), Sum("o", True, False)))
 
@@ -34,15 +35,17 @@ def term_of(kind):
 @pytest.mark.parametrize("number", range(len(KINDS)), ids=[kind.name for kind in KINDS])
 def test_masks_and_sums_compile(number, other):
     """Kinds in turn with and without distances, and compensated sums; `other`: the other way round."""
-    kind, odd, periodic = KINDS[number], (number % 2 == 1) is not other, bool(KINDS[number].periodic)
+    kind, odd, periodic = KINDS[number], (number % 2 == 1) is not other, bool(KINDS[number].kind.periodic)
+    sums = kind._replace(kind=kind.kind._replace(compensated=odd), apart=kind.reversed, mirrored=odd)
     # what a term reads of i stands beside the points, or does not
-    assert compiles(kept.sum_kernel(kind, term_of(kind), f"test_{periodic}", odd, False, kind.reversed, odd))
+    assert compiles(kept.sum_kernel(sums, term_of(kind), f"test_{periodic}"))
     if not kind.reversed:
-        assert compiles(kept.mask_kernel(kind, odd))
+        assert compiles(kept.mask_kernel(kind._replace(measured=odd)))
     if odd:
         assert kind.reversed or compiles(kept.slope_kernel(kind))
         largest = term_of(kind)._replace(sums=(Sum("o", False, False),))
-        assert compiles(kept.sum_kernel(kind, largest, f"largest_{periodic}", False, True, False, False))
+        extremes = kind._replace(kind=kind.kind._replace(extremes=True))
+        assert compiles(kept.sum_kernel(extremes, largest, f"largest_{periodic}"))
 
 
 @pytest.mark.parametrize("code_bytes", [0, 1, 2, 4])

@@ -12,11 +12,11 @@ import pytest
 
 import jfrnn
 from jfrnn._engine import boxes_warp, warp_sums
-from jfrnn._engine.variants import SumVariant, names_of_cutoffs, names_of_tree
-from jfrnn._search.problem import check_problem
+from jfrnn._engine.variants import SUMS, names_of_cutoffs, names_of_tree
+from jfrnn._search.problem import Asked, check_problem
 from jfrnn._sums import fused as _fused
 from jfrnn._sums.verb import _with_engine
-from jfrnn.kernels import _compile, few_cuda, pair_sum_cpu, pair_sum_cuda
+from jfrnn.kernels import Kind, _compile, few_cuda, pair_sum_cpu, pair_sum_cuda
 from jfrnn.kernels._native import EXCLUDED, TABLE
 
 CUTOFF = 0.1
@@ -60,13 +60,10 @@ def arguments(dtype, dim):
 
 
 def compiles_for(plan, dim, double, **variant):
-    options = {"scaled": False, "compensated": False} | variant
-    kernels = [kernel for kernel in pair_sum_cuda.sum_kernels(plan.text, plan.key, dim, double, **options) if kernel is not None]
-    if not options["scaled"] and options.get("periodic", 0) <= 1:
-        few = {name: value for name, value in options.items() if name not in ("scaled", "periodic")}
-        kernels.append(
-            few_cuda.sum_kernel(32 if double else 8, plan.text, plan.key, dim, double, **few, boxed=options.get("periodic") == 1)
-        )
+    kind = Kind(dim, double, **variant)
+    kernels = [kernel for kernel in pair_sum_cuda.sum_kernels(kind, plan.text, plan.key) if kernel is not None]
+    if not kind.scaled and kind.periodic <= 1:
+        kernels.append(few_cuda.sum_kernel(kind, 32 if double else 8, plan.text, plan.key))
     return all(f".entry {x.name}(" in _compile.find_binary(x.program, arch=90).read_text() for x in kernels)
 
 
@@ -127,14 +124,14 @@ def test_extremes_compile(dtype, variant):
 def test_terms_that_read_nothing_compile():
     plan = plan_of(lambda x: jfrnn.pair_sum(lambda r, i, j: 1.0, x, CUTOFF, backend="warp"), jnp.zeros((4, 3), np.float32))
     assert not (plan.text.own or plan.text.source_columns)
-    kernels = pair_sum_cuda.sum_kernels(plan.text, plan.key, 3, False, False, False)
+    kernels = pair_sum_cuda.sum_kernels(Kind(3, False), plan.text, plan.key)
     assert kernels.sort_values is None
     assert compiles_for(plan, 3, False)
 
 
 def test_what_a_term_reads_is_sorted_before_it_is_summed():
     plan = plan_of(square_sum, *arguments(np.float32, 3)[:3])
-    kernels = pair_sum_cuda.sum_kernels(plan.text, plan.key, 3, False, False, False)
+    kernels = pair_sum_cuda.sum_kernels(Kind(3, False), plan.text, plan.key)
     sort_values, query = kernels.launches(1000, 500, 132)
     assert (sort_values.kernel, query.kernel) == (kernels.sort_values, kernels.query)
     assert query.threads == 32 * pair_sum_cuda.slots(500)
@@ -144,7 +141,7 @@ def test_what_a_term_reads_is_sorted_before_it_is_summed():
 def test_queries_that_leave_a_box_have_a_kernel_beside_the_others():
     masses, x, scale, _ = arguments(np.float32, 3)
     plan = plan_of(functools.partial(square_sum, box=jfrnn.Box([2.0, 2.0, 2.0])), masses, x, scale)
-    kernels = pair_sum_cuda.sum_kernels(plan.text, plan.key, 3, False, False, False, periodic=1)
+    kernels = pair_sum_cuda.sum_kernels(Kind(3, False, periodic=1), plan.text, plan.key)
     launches = kernels.launches(1000, 500, 132)
     assert [launch.kernel for launch in launches] == [kernels.sort_values, kernels.crossing, kernels.query]
     assert [launch.beside for launch in launches] == [False, False, True]
@@ -165,7 +162,7 @@ def test_rows_of_values_begin_where_16_bytes_may_be_loaded(double):
 
 def test_auto_takes_the_kernel_on_cuda_and_jax_elsewhere(monkeypatch):
     x = np.zeros((4, 3), np.float32)
-    problem, inputs = check_problem(x, 1.0, None, None, None, "gather", None, None, False, False, False, "auto", 0.0, None)
+    problem, inputs = check_problem(Asked(x, 1.0))
     monkeypatch.setattr("jfrnn._sums.verb.platform_of", lambda *_: "gpu")
     for backend in ("auto", "warp"):
         options = _with_engine(problem.options, inputs, backend == "auto")
@@ -180,7 +177,7 @@ def test_a_box_holds_as_many_particles_as_their_numbers_leave_room_for(monkeypat
     """An image's code takes bits of the number; on the CPU it does not."""
     monkeypatch.setattr(_fused, "MOST_IN_BOX", 4)
     x, box = np.zeros((4, 3), np.float32), jfrnn.Box([4.0] * 3)
-    _, inputs = check_problem(x, 1.0, None, box, None, "gather", None, None, False, False, False, "warp", 0.0, None)
+    _, inputs = check_problem(Asked(x, 1.0, box=box, backend="warp"))
     assert _fused.refusal(inputs, "cpu") is None
     assert _fused.refusal(inputs._replace(box=None), "gpu") is None
     assert _fused.refusal(inputs, "gpu") == "of more than 3 positions in a periodic box on the platform 'gpu'"
@@ -196,14 +193,17 @@ def test_programs_for_cuda_call_it_and_plans_have_the_arguments_of_their_kernels
     assert f'"jfrnn_pair_sum_cuda_3d_f32_own_dropself_{"nearest_" * periodic}' in program
     plan = plan_of(functools.partial(square_sum, box=box), *arguments(np.float32, 3)[:3])
     assert f'"jfrnn_sorting_cuda_3d_f32_own{"_nearest" * periodic}@' in program
-    variant = SumVariant(3, False, False, True, False, True, periodic, False, False, False, plan.key, True, False, False)
+    kind = Kind(3, False, own=True, drop_self=True, periodic=periodic)
     given = {name: (40, 3) for name in warp_sums._GIVEN}
-    sorting = warp_sums._plan_sorting(warp_sums._sorting(variant), given, 132)
-    summing = warp_sums._plan_on_cuda(variant, plan.text, given, 132)
+    sorting = warp_sums._plan_sorting(kind, given, 132)
+    summing = warp_sums._plan_on_cuda(kind, plan.text, plan.key, given, 132)
     assert (len(sorting.steps), len(summing.steps)) == (6, 2 + periodic)
     assert [step.beside for step in summing.steps] == [False] * (1 + periodic) + [bool(periodic)]
     words = {"info", "scratch"}
-    for found, arrays in ((sorting, {*warp_sums._GIVEN[:3], *words}), (summing, {*given, *words, *warp_sums._RESULTS, "values"})):
+    for found, arrays in (
+        (sorting, {*warp_sums._GIVEN[:3], *words}),
+        (summing, {*given, *words, *SUMS, "values"}),
+    ):
         for step in found.steps:
             numbers = {**found.numbers, **step.numbers}
             assert {field.name for field in step.kernel.fields if field.is_array} <= arrays | {*found.absent, *SPARED}
@@ -224,23 +224,22 @@ def test_cutoffs_that_differ_compile_and_plans_have_the_arguments_of_their_kerne
     text = program.trace(x).lower(lowering_platforms=("cuda",)).as_text()
     plan = plan_of(density, x)
     if boxes:
-        assert f'"jfrnn_box_sums_cuda_3d_f32_scaled_own_dropself_batched_images_skewed_{rule}_' in text
-        assert f'"jfrnn_box_rows_cuda_3d_f32_scaled_list_images_skewed_batched_own_dropself_{rule}@' in text
-        variant = SumVariant(3, False, True, True, False, True, 4, True, False, False, plan.key, True, False, False, rule)
-        names = (*boxes_warp._GIVEN, "shared_values", "own_values", "columns", *names_of_cutoffs(rule), *boxes_warp._SUMS, "info")
-        found = boxes_warp._plan_sums_on_cuda(variant, plan.text, {name: (n, 4) for name in names}, 132)
+        assert f'"jfrnn_box_sums_cuda_3d_f32_scaled_own_dropself_images_skewed_boxes_{rule}_' in text
+        assert f'"jfrnn_box_rows_cuda_3d_f32_scaled_own_dropself_list_images_skewed_boxes_{rule}@' in text
+        kind = Kind(3, False, scaled=True, own=True, drop_self=True, periodic=4, batched=2, rule=rule)
+        names = (*boxes_warp._GIVEN, "shared_values", "own_values", "columns", *names_of_cutoffs(rule), *SUMS, "info")
+        found = boxes_warp._plan_sums_on_cuda(kind, plan.text, plan.key, {name: (n, 4) for name in names}, 132)
         assert len(found.steps) == 1
     else:
         assert f'"jfrnn_pair_sum_cuda_3d_f32_scaled_own_dropself_{rule}_tree_' in text
         assert f'"jfrnn_sorting_cuda_3d_f32_scaled_own_{rule}_tree@' in text
         assert f'"jfrnn_pair_sum_cuda_3d_f32_scaled_own_dropself_{rule}_' in text
-        kind = (False, False, plan.key, True, False, False, rule, True)
-        variant = SumVariant(3, False, True, True, False, True, 0, False, *kind)
-        names = (*warp_sums._GIVEN, *names_of_tree(rule), *warp_sums._RESULTS, "values", "info", "scratch")
+        kind = Kind(3, False, scaled=True, own=True, drop_self=True, rule=rule, tree=True)
+        names = (*warp_sums._GIVEN, *names_of_tree(rule), *SUMS, "values", "info", "scratch")
         shapes = {name: (n, 4) for name in names}
-        found = warp_sums._plan_sorting(warp_sums._sorting(variant), shapes, 132)
+        found = warp_sums._plan_sorting(kind, shapes, 132)
         assert [getattr(step, "threads", 0) for step in found.steps] == [0, 0, 64, 32]  # two leaves, and a root
-        summing = warp_sums._plan_on_cuda(variant, plan.text, shapes, 132)
+        summing = warp_sums._plan_on_cuda(kind, plan.text, plan.key, shapes, 132)
         numbers = {**found.numbers, **summing.numbers, "level": 1}
         found = summing._replace(steps=[*found.steps[-1:], *summing.steps], numbers=numbers)
     for launch in found.steps:
@@ -252,13 +251,13 @@ def test_cutoffs_that_differ_compile_and_plans_have_the_arguments_of_their_kerne
 def test_few_particles_take_one_launch():
     x = jnp.zeros((40, 3), np.float32)
     plan = plan_of(lambda x: jfrnn.pair_sum(poly6, x, CUTOFF, x[:, 0], backend="warp"), x)
-    variant = SumVariant(3, False, False, True, False, True, 0, False, False, False, plan.key, True, True, False)
-    found = warp_sums._plan_few(variant, plan.text, {name: (40, 3) for name in warp_sums._GIVEN}, 132)
+    kind = Kind(3, False, own=True, drop_self=True)
+    found = warp_sums._plan_few(kind, plan.text, plan.key, {name: (40, 3) for name in warp_sums._GIVEN}, 132)
     (launch,) = found.steps
     assert launch.threads // launch.kernel.block == few_cuda.blocks(40) == 5
     assert [few_cuda.blocks(m) * few_cuda.warps(m) for m in (1, 41, 1025, 4095)] == [8, 48, 1040, 4096]  # everyone is served
     assert [few_cuda.warps(m) for m in (0, 1, 1024, 1025, 2048, 2049, few_cuda.MOST)] == [8, 8, 8, 16, 16, 32, 32]
-    arrays = {*warp_sums._GIVEN, *warp_sums._RESULTS}
+    arrays = {*warp_sums._GIVEN, *SUMS}
     assert {field.name for field in launch.kernel.fields} <= arrays | {*found.numbers, *EXCLUDED}
     for size, few in ((few_cuda.MOST, True), (few_cuda.MOST + 1, False)):
         program = jax.jit(lambda x: jfrnn.count(x, CUTOFF, backend="warp")).trace(jnp.zeros((size, 3), np.float32))

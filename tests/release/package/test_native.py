@@ -1,5 +1,6 @@
 """Headers of `kernels/native` compile by themselves, and structures that mirror XLA's C interface are those of its header."""
 
+import re
 import shutil
 import subprocess
 from pathlib import Path
@@ -17,7 +18,24 @@ from jfrnn.kernels.launch import write_launcher
 
 NATIVE = ROOT / "kernels" / "native"
 LAUNCHING = ("calls.h", "desk.h", "launch.h")  # which need XLA's header
-WHOLE = sorted(path.name for path in NATIVE.iterdir())
+WHOLE = sorted(path.name for path in NATIVE.rglob("*.*"))
+
+
+FLOORS = [{"common"}, {"decide", "math", "launch", "reverse"}, {"cells", "tree", "walk"}, {"rows", "sums"}]  # and all others
+
+
+def test_folders_include_from_below_and_stand_on_the_page():
+    """Headers are found by name, so each name is there once; the table of the product names all of them, and no others."""
+    folder_of = {path.name: path.parent.name for path in NATIVE.rglob("*.*")}
+    assert len(folder_of) == len(WHOLE)
+    height = {folder: k for k, floor in enumerate(FLOORS) for folder in floor}
+    for path in NATIVE.rglob("*.*"):
+        own = path.parent.name
+        for header in re.findall(r'^#include "(.+)"', path.read_text(), re.MULTILINE):
+            other = folder_of.get(header, own)
+            assert other == own or height[other] < height.get(own, len(FLOORS)) or {own, other} <= FLOORS[2], (path, header)
+    page = (ROOT / "docs/developers/product.md").read_text()
+    assert set(re.findall(r"`(\w+\.(?:h|cuh))`", page)) == set(WHOLE)
 
 
 def is_cpu_only(header):

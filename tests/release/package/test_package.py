@@ -69,7 +69,7 @@ def test_wheel_holds_the_library_alone(wheel):
     assert {name.split("/")[0] for name in names} == {"jfrnn", "jfrnn_ase_plugin.py", f"jfrnn-{jfrnn.__version__}.dist-info"}
     assert {Path(name).suffix for name in names if not name.startswith("jfrnn-")} == {".py", ".typed", ".h", ".cuh"}
     held = {Path(name).name for name in names if "/native/" in name}
-    assert held == {path.name for path in (ROOT / "kernels" / "native").iterdir() if path.suffix in (".py", ".h", ".cuh")}
+    assert held == {path.name for path in (ROOT / "kernels" / "native").rglob("*") if path.suffix in (".py", ".h", ".cuh")}
 
 
 def test_a_wheel_made_from_the_sdist_holds_the_same(wheel, tmp_path):

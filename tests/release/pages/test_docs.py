@@ -15,7 +15,7 @@ from experiments import pages
 from experiments._errors import UsageError
 from experiments.pages.rows import TIMES
 from jfrnn import distributed, sph
-from jfrnn._engine import ENGINES, Kind
+from jfrnn._engine import ENGINES, Features
 from jfrnn._shards.calls import BACKENDS
 from jfrnn._triangles.engines import TRIANGLE_ENGINES
 
@@ -90,8 +90,8 @@ def test_engines_can_what_the_readme_says():
     names = [cell.strip("`") for cell in lines[0][1:]]
     said = {line[0]: dict(zip(names, line[1:])) for line in lines}
     assert set(names) == set(ENGINES)
-    asked = {"periodic boxes, batches": Kind(periodic=True, batch=True), "`pair_sum`": Kind(summed=True)}
-    asked |= {"a cutoff per particle or per pair of species": Kind(radii=True), "excluded pairs": Kind(excluding=True)}
+    asked = {"periodic boxes, batches": Features(periodic=True, batch=True), "`pair_sum`": Features(summed=True)}
+    asked |= {"a cutoff per particle or per pair of species": Features(radii=True), "excluded pairs": Features(excluding=True)}
     for title, kind in asked.items():
         for name, engine in ENGINES.items():
             assert (said[title][name] == "no") == (engine.refuse(kind) is not None), (title, name)
