@@ -1,7 +1,7 @@
 """Octaves of cutoffs: cells as wide as a cutoff serve all that are at least half as long, and shorter ones get cells of their own.
 
-Where each particle has its own cutoff, pairs are found part by part. Octave k holds the particles whose cutoffs are above 2^-(k+1)
-and at most 2^-k of the largest one; a pair belongs to the octave of the cutoff that decides about it. For each octave, the sources
+Where each particle has its own cutoff, pairs are found part by part. Octave k holds the particles whose cutoffs are at least 2^-(k+1)
+and less than 2^-k of the largest one, but for a little; a pair belongs to the octave of the cutoff that decides about it. For each octave, the sources
 that such pairs may have are sorted into cells of its width (`jfrnn._geometry.cell_line`), and the queries that such pairs may have
 look around. So the number of candidates follows the number of particles within the cutoffs of an octave, whatever others are. What
 an octave costs besides is a sort, and octaves without particles cost nothing. Krijgsman, Ogarko & Luding (2014,
@@ -17,6 +17,7 @@ from jax import Array, lax
 from jfrnn._geometry.cutoffs import Cutoffs
 
 OCTAVES = 24  # the last one holds all shorter cutoffs
+_LITTLE = 1 - 2.0**-10
 _LONGER = (
     "either",
     "mean",
@@ -102,6 +103,9 @@ def parts_of(cutoffs: Cutoffs, sources: Array, queries: Array) -> Parts:
 
 
 def octaves_of(radii: Array, largest: Array, count: int) -> Array:
-    """Return the octave of each cutoff [k] among so many, int32: how often the largest one can be halved until it is shorter."""
-    bounds = largest * jnp.asarray(2.0 ** -np.arange(1, count), radii.dtype)
-    return jnp.sum(radii[:, None] <= bounds, axis=1, dtype=jnp.int32)
+    """Return the octave of each cutoff [k] among so many, int32: how often the largest one can be halved and is still longer.
+
+    Cutoffs that are a little shorter count as if they were not, so that rounding moves none out of an octave of whole factors.
+    """
+    bounds = largest * jnp.asarray(_LITTLE * 2.0 ** -np.arange(1, count), radii.dtype)
+    return jnp.sum(radii[:, None] < bounds, axis=1, dtype=jnp.int32)
