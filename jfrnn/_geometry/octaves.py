@@ -1,11 +1,11 @@
-"""Octaves of cutoffs: cells as wide as a cutoff serve all that are at least half as long, and shorter ones get cells of their own.
+"""Octaves of cutoffs: cells as wide as a cutoff serve all that are at least half as long; shorter ones get cells of their own.
 
-Where each particle has its own cutoff, pairs are found part by part. Octave k holds the particles whose cutoffs are at least 2^-(k+1)
-and less than 2^-k of the largest one, but for a little; a pair belongs to the octave of the cutoff that decides about it. For each octave, the sources
-that such pairs may have are sorted into cells of its width (`jfrnn._geometry.cell_line`), and the queries that such pairs may have
-look around. So the number of candidates follows the number of particles within the cutoffs of an octave, whatever others are. What
-an octave costs besides is a sort, and octaves without particles cost nothing. Krijgsman, Ogarko & Luding (2014,
-doi:10.1007/s40571-014-0020-9) divide grains by size likewise.
+Where each particle has its own cutoff, pairs are found part by part. Octave k holds the particles whose cutoffs are at least
+2^-(k+1) and less than 2^-k of the largest one, but for a little; a pair belongs to the octave of the cutoff that decides about it.
+For each octave, the sources that such pairs may have are sorted into cells of its width (`jfrnn._geometry.cell_line`), and the
+queries that such pairs may have look around. So the number of candidates follows the number of particles within the cutoffs of an
+octave, whatever others are. What an octave costs besides is a sort, and octaves without particles cost nothing. Krijgsman, Ogarko
+& Luding (2014, doi:10.1007/s40571-014-0020-9) divide grains by size likewise.
 """
 
 from typing import NamedTuple
