@@ -58,6 +58,15 @@ def cutoffs() -> str:
     return _table(lines, columns, lambda row: row["option"] + said.get(row["beside"], f", against {row['beside']}"))
 
 
+def by_arrays() -> str:
+    """Return what options cost the engine `jax` on a CPU."""
+    rows = [row for row in read("options/cpu_jax.csv") if row["status"] == "ok"]
+    where = Machine(machine(rows), rows)
+    columns = [(where, f"{what}_ratio", title) for what, title in _WHATS.items()]
+    said = {AS_MANY: "", FIRST: ""}
+    return _table(rows, columns, lambda row: row["option"] + said.get(row["beside"], f", against {row['beside']}"))
+
+
 def _about_cutoffs(row: Row) -> bool:
     return bool(row["spread"]) or row["beside"] != FIRST
 
@@ -110,6 +119,6 @@ def spread_rows(where: Machine) -> list[Row]:
     ]
 
 
-TABLES = {"options": options, "cutoffs": cutoffs}
+TABLES = {"options": options, "cutoffs": cutoffs, "options-jax": by_arrays}
 VALUES: dict[str, Callable[[], str]] = {f"cost-{name}": partial(_cost, option) for name, option in _COSTS.items()}
 VALUES |= {"cost-density": _density, "cost-where": _where}
