@@ -22,7 +22,7 @@ import numpy as np
 from jax import Array, lax
 
 from jfrnn._engine.boxes import find_in_boxes
-from jfrnn._engine.candidates import Candidates, Excluded, Points, Span, Torus
+from jfrnn._engine.candidates import NOWHERE, Candidates, Excluded, Points, Span, Torus
 from jfrnn._engine.problem import Features, Options, Room, Rows, Search, largest_radius
 from jfrnn._engine.runs import State, count_neighbors, fill_neighbors, list_neighbors
 from jfrnn._engine.tuning import Tuning, by_platform
@@ -30,7 +30,6 @@ from jfrnn._engine.words import CHUNK, LANES
 from jfrnn._geometry import (
     FINE,
     CellAxes,
-    CellLine,
     Cells,
     Cutoff,
     Cutoffs,
@@ -97,18 +96,18 @@ class ArrayEngine:
         counts = jnp.zeros(m, jnp.int32)
         if capacity is None:
 
-            def count(candidates: Candidates, old: list[Array] | None) -> list[Array]:
-                return count_neighbors(candidates, cutoff, keep, tuning, old)
+            def count(candidates: Candidates, state: list[Array]) -> list[Array]:
+                return count_neighbors(candidates, cutoff, keep, tuning, state)
 
             (counts,) = fold_candidates(search, by_cells, tuning, count, [counts])
             return complete_rows(search, None, counts, None)
 
-        def fill(candidates: Candidates, old: list[Array] | None) -> list[Array]:
-            return list_neighbors(candidates, cutoff, keep, capacity, tuning, old)
+        def fill(candidates: Candidates, state: list[Array]) -> list[Array]:
+            return list_neighbors(candidates, cutoff, keep, capacity, tuning, state)
 
-        images = 1 if search.torus is None or search.torus[0].images.nearest else search.torus[0].images.total
-        blank = jnp.full((m, capacity), n * images, jnp.int32)
-        idx, counts = fold_candidates(search, by_cells, tuning, fill, [blank, counts])
+        images = 1 if search.lattice is None or search.lattice.images.nearest else search.lattice.images.total
+        unused = jnp.full((m, capacity), n * images, jnp.int32)
+        idx, counts = fold_candidates(search, by_cells, tuning, fill, [unused, counts])
         return complete_rows(search, idx, counts, capacity)
 
     def _flat_rows(self, search: Search, options: Options, room: Room) -> Rows:
@@ -117,8 +116,8 @@ class ArrayEngine:
                 (search, starts), keep = operands, options.filter
                 whole = Room(starts, room.total)
 
-                def step(candidates: Candidates, old: list[Array] | None) -> list[Array]:
-                    return fill_neighbors(candidates, search.cutoff, keep, whole, tuning, old)
+                def step(candidates: Candidates, state: list[Array]) -> list[Array]:
+                    return fill_neighbors(candidates, search.cutoff, keep, whole, tuning, state)
 
                 by_cells = self.by_cells and not is_few(search, tuning)
                 return fold_candidates(search, by_cells, tuning, step, [jnp.zeros(room.total, jnp.int32), starts[:-1]])[0]
@@ -163,22 +162,18 @@ def complete_rows(search: Search, idx: Array | None, count: Array, capacity: int
 
 
 def fold_candidates(
-    search: Search,
-    by_cells: bool,
-    tuning: Tuning,
-    step: Callable[[Candidates, State | None], State],
-    start: State,
+    search: Search, by_cells: bool, tuning: Tuning, step: Callable[[Candidates, State], State], state: State
 ) -> State:
-    """Return step(candidates, None), or, where cutoffs differ, the state after state = step(candidates, state) for each octave.
+    """Return the state after state = step(candidates, state): once or, where cutoffs differ, for the candidates of each octave.
 
-    Candidates are all sources (brute force), or those of cells. `start` is what the state of several steps begins with.
+    Candidates are all sources (brute force), or those of cells.
     """
     if search.per_system:
-        return step(_complete(search, find_in_boxes(search, by_cells)), None)
+        return step(_complete(search, find_in_boxes(search, by_cells)), state)
     if not by_cells:
-        return step(_complete(search, _all_sources(search)), None)
+        return step(_complete(search, _all_sources(search)), state)
     if isinstance(search.cutoff, Cutoff):
-        return step(_complete(search, _cell_stencil(search, tuning)), None)
+        return step(_complete(search, _cell_stencil(search, tuning)), state)
     there = (search.sources, search.sources if search.queries is None else search.queries)
     parts = parts_of(search.cutoffs.of_cells, *(jnp.isfinite(x).all(axis=1) for x in there))
 
@@ -187,7 +182,7 @@ def fold_candidates(
         candidates = _cell_stencil(search, tuning, parts.part(number, search.sources.dtype))
         return parts.after(number), step(_complete(search, candidates), state)
 
-    return lax.while_loop(lambda now: now[0] < parts.end, take, (parts.after(-1), start))[1]
+    return lax.while_loop(lambda now: now[0] < parts.end, take, (parts.after(-1), state))[1]
 
 
 def _complete(search: Search, found: Candidates) -> Candidates:
@@ -197,17 +192,21 @@ def _complete(search: Search, found: Candidates) -> Candidates:
     return found._replace(given=(search.sources, search.sources if search.queries is None else search.queries))
 
 
-def _place_excluded(candidates: Candidates, exclude: ExcludedCodes) -> Excluded:
-    """Return where excluded sources stand among the candidates; those that stand nowhere are placed before all others."""
+def _places_of(candidates: Candidates) -> Array:
+    """Return where each source stands among the candidates, for the first time; NOWHERE if it does not."""
     n, place = candidates.size, lax.iota(jnp.int32, candidates.size)
     ids = candidates.sources.ids[:n]
     if candidates.again is not None:
         ids = jnp.where(place < candidates.again, ids, n)
-    places = jnp.full(n, -(1 << 30), jnp.int32).at[ids].set(place, mode="drop")
-    found = places[exclude.others]
+    return jnp.full(n, NOWHERE, jnp.int32).at[ids].set(place, mode="drop")
+
+
+def _place_excluded(candidates: Candidates, exclude: ExcludedCodes) -> Excluded:
+    """Return where excluded sources stand among the candidates; those that stand nowhere are placed before all others."""
+    found = _places_of(candidates)[exclude.others]
     if exclude.codes is None or candidates.torus is not None:
         return Excluded(exclude.starts, found, exclude.codes)
-    return Excluded(exclude.starts, jnp.where(exclude.codes < 0, -(1 << 30), found))
+    return Excluded(exclude.starts, jnp.where(exclude.codes < 0, NOWHERE, found))
 
 
 def _clouds(search: Search) -> tuple[Array, Array | None, Torus | None]:
@@ -307,19 +306,17 @@ def _cell_stencil(search: Search, tuning: Tuning, part: Part | None = None) -> C
         rows = rows._replace(systems=batch.of_queries[order])
     words = functools.partial(_stencil_words, sources.shape[1])
     found = Candidates(points, rows, runs, torus, n, words, again=line.inside)
-    return found if part is None else _of_part(found, search.cutoffs, part, line, own)
+    return found if part is None else _of_part(found, search.cutoffs, part, own)
 
 
-def _of_part(found: Candidates, cutoffs: Cutoffs, part: Part, line: CellLine, own: bool) -> Candidates:
+def _of_part(found: Candidates, cutoffs: Cutoffs, part: Part, own: bool) -> Candidates:
     """Add to the candidates of a part the cutoffs, and where queries that are sources stand."""
     of_sources, of_queries = cutoffs.of_points
-    points, rows, place = found.sources, found.queries, lax.iota(jnp.int32, found.size)
+    points, rows = found.sources, found.queries
     points = points._replace(radii=None if of_sources is None else of_sources[points.ids])
     rows = rows._replace(radii=None if of_queries is None else of_queries[rows.ids])
     if own:
-        nowhere = np.int32(-(1 << 30))
-        places = jnp.zeros_like(place).at[line.order].set(jnp.where(place < line.inside, place, nowhere), unique_indices=True)
-        rows = rows._replace(places=places[rows.ids])
+        rows = rows._replace(places=_places_of(found)[rows.ids])
     return found._replace(sources=points, queries=rows, active=jnp.sum(part.queries, dtype=jnp.int32))
 
 

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from jfrnn._engine.candidates import Candidates, Excluded, Points, Span, Torus
+from jfrnn._engine.candidates import NOWHERE, Candidates, Excluded, Points, Span, Torus
 from jfrnn._engine.problem import Filter
 from jfrnn._engine.tuning import SLOT_BYTES, WORD_BYTES, Tuning
 from jfrnn._engine.words import CHUNK, HITS, LANES, BitRows, Lanes, bit_counts, join_lanes, last_reached, nth_bit
@@ -167,16 +167,19 @@ class BlockSearch(NamedTuple):
         """Say which queries of block b no earlier block has, [b] bool."""
         return span.places >= b * self.block_size
 
-    def map_blocks(
-        self, of_block: Callable[[Span, list[Array]], list[Array]], start: list[Array], old: list[Array] | None
-    ) -> list[Array]:
+    def map_blocks(self, of_block: Callable[[Span, list[Array]], list[Array]], state: list[Array]) -> list[Array]:
         """Return of_block(span, rows), int32 arrays with a row per query, for all queries in the order of their indices.
 
-        `rows` are what these rows are before: those of `old`, or all of them the row `start` of each array.
+        `rows` are what `state` has of these queries. Where all candidates are met at once, its rows are alike.
         """
-        ids, blank = self.queries.ids, [jnp.broadcast_to(x, (self.block_size, *x.shape)) for x in start]
+        ids, several = self.queries.ids, self.candidates.active is not None
+        alike = [jnp.broadcast_to(x[:1], (self.block_size, *x.shape[1:])) for x in state]
+
+        def rows_of(state: list[Array], here: Array) -> list[Array]:
+            return [x.at[here].get(mode="promise_in_bounds") for x in state] if several else alike
+
         if self.block_count == 1:
-            rows = of_block(self.block(0), blank if old is None else [x.at[ids].get(mode="promise_in_bounds") for x in old])
+            rows = of_block(self.block(0), rows_of(state, ids))
             if self.candidates.in_order:
                 return rows
             place = jnp.zeros_like(ids).at[ids].set(lax.iota(jnp.int32, ids.size), unique_indices=True)
@@ -185,18 +188,12 @@ class BlockSearch(NamedTuple):
         def put(b: Array, out: list[Array]) -> list[Array]:
             span = self.block(b)
             here = span.of(ids)
-            return [x.at[here].set(rows, unique_indices=True) for x, rows in zip(out, of_block(span, blank), strict=True)]
+            found = of_block(span, rows_of(out, here))
+            if several:  # what two blocks have is added once
+                here = jnp.where(self.fresh(b, span), here, ids.size + lax.iota(jnp.int32, span.size))
+            return [x.at[here].set(rows, mode="drop", unique_indices=True) for x, rows in zip(out, found, strict=True)]
 
-        def put_more(b: Array, out: list[Array]) -> list[Array]:
-            span = self.block(b)
-            here = span.of(ids)
-            found = of_block(span, [x.at[here].get(mode="promise_in_bounds") for x in out])
-            here = jnp.where(self.fresh(b, span), here, ids.size)
-            return [x.at[here].set(rows, mode="drop") for x, rows in zip(out, found, strict=True)]
-
-        if old is not None:
-            return lax.fori_loop(0, self.used_blocks, put_more, old)
-        return lax.fori_loop(0, self.block_count, put, [jnp.zeros((ids.size, *x.shape), jnp.int32) for x in start])
+        return lax.fori_loop(0, self.used_blocks, put, state)
 
     def fold_words(self, span: Span, add: "Add[State]", state: State, few: tuple["Add[State]", int] | None = None) -> State:
         """Return the state after state = add(words, state) for each chunk of candidates of the queries at these positions.
@@ -461,16 +458,14 @@ class BlockSearch(NamedTuple):
     def _own_lanes(self, first: Array, image: Array | None, span: Span) -> Array:
         """Return which of a word's 16 candidates is the query itself, if that is finite: bits, [b, words] uint32."""
         finite = functools.reduce(jnp.logical_and, (jnp.isfinite(span.of(x)) for x in self.queries.axes))
-        itself, torus = (
-            jnp.where(finite[:, None], self._lanes_at(self._own_places(span), first), np.uint32(0)),
-            self.candidates.torus,
-        )
+        own, torus = self._lanes_at(self._own_places(span), first), self.candidates.torus
+        itself = jnp.where(finite[:, None], own, np.uint32(0))
         if image is None or torus is None:
             return itself
         return jnp.where(image == torus.images.home, itself, np.uint32(0))
 
     def _own_places(self, span: Span) -> Array:
-        """Return where queries stand among the sources [b], negative if nowhere."""
+        """Return where queries stand among the sources [b], NOWHERE if they do not."""
         return span.places if self.queries.places is None else span.of(self.queries.places)
 
     def _lanes_at(self, place: Array, first: Array) -> Array:
@@ -490,7 +485,7 @@ class BlockSearch(NamedTuple):
 
         def add(k: Array, lanes: Array) -> Array:
             at = jnp.minimum(begin + k, excluded.places.size - 1)
-            found = self._lanes_at(jnp.where(begin + k < end, flat_take(excluded.places, at), -(1 << 30)), first)
+            found = self._lanes_at(jnp.where(begin + k < end, flat_take(excluded.places, at), NOWHERE), first)
             if excluded.codes is not None and image is not None:
                 found = jnp.where(image == flat_take(excluded.codes, at)[:, None], found, np.uint32(0))
             return lanes | found

@@ -8,6 +8,8 @@ from jax import Array, lax
 
 from jfrnn._geometry import Images
 
+NOWHERE = -(1 << 30)  # the place of what stands nowhere among the candidates: before all words
+
 
 class Span(NamedTuple):
     """Queries at consecutive positions of their order.
@@ -42,7 +44,7 @@ class Points(NamedTuple):
         ids: [n] int32, their indices.
         radii: [n] cutoffs per particle, or species with a table of cutoffs; None with one cutoff or if the rule does not use them.
         systems: [n] systems of a batch, or None if runs meet no other system than that of their query.
-        places: Of queries that are sources: [m] int32, where each stands among these, negative if nowhere; None: as it is visited.
+        places: For queries that are sources [m] int32, where each stands among these, or NOWHERE; None: as it is visited.
     """
 
     axes: list[Array]
@@ -75,7 +77,7 @@ class Excluded(NamedTuple):
 
     Attributes:
         starts: [m + 1] int32, where the row of each query begins, by the queries' ids, and where the last one ends.
-        places: [k] int32, positions of excluded sources, row after row; negative for those that have none.
+        places: [k] int32, positions of excluded sources, row after row; NOWHERE for those that have none.
         codes: [k] int32, the images that are excluded; None: all are.
     """
 

@@ -116,9 +116,8 @@ def fold_pairs(inputs: Inputs, options: Options, elements: int, visit: Visit[Sta
         def fold(operands: tuple[Search, State]) -> State:
             search, out = operands
 
-            def step(candidates: Candidates, old: State | None) -> State:
-                begin = out if old is None else old
-                return fold_neighbors(candidates, search.cutoff, options.filter, elements, tuning, visit, begin)
+            def step(candidates: Candidates, state: State) -> State:
+                return fold_neighbors(candidates, search.cutoff, options.filter, elements, tuning, visit, state)
 
             return fold_candidates(search, options.engine.by_cells and not is_few(search, tuning), tuning, step, out)
 

@@ -22,9 +22,9 @@ Carry = Any  # the state of a loop over pairs
 
 
 def count_neighbors(
-    candidates: Candidates, cutoff: Cutoff | Cutoffs, keep: Filter, tuning: Tuning, old: list[Array] | None
+    candidates: Candidates, cutoff: Cutoff | Cutoffs, keep: Filter, tuning: Tuning, state: list[Array]
 ) -> list[Array]:
-    """Count the neighbors of every query: [m] int32, in the order of the queries' ids; added to `old` ones."""
+    """Add the neighbors of every query to a count: [m] int32, in the order of the queries' ids."""
     engine = BlockSearch(candidates, cutoff, keep, tuning, slots=1, capacity=None)
 
     def count_block(span: Span, rows: list[Array]) -> list[Array]:
@@ -33,23 +33,22 @@ def count_neighbors(
 
         return [engine.fold_words(span, add, rows[0])]
 
-    return engine.map_blocks(count_block, [jnp.int32(0)], old)
+    return engine.map_blocks(count_block, state)
 
 
 def list_neighbors(
-    candidates: Candidates, cutoff: Cutoff | Cutoffs, keep: Filter, capacity: int, tuning: Tuning, old: list[Array] | None
+    candidates: Candidates, cutoff: Cutoff | Cutoffs, keep: Filter, capacity: int, tuning: Tuning, state: list[Array]
 ) -> list[Array]:
-    """List the neighbors of every query: [m, capacity] int32 source indices, unused slots n, and [m] int32 true counts.
+    """Add the neighbors of every query to rows and counts: [m, capacity] int32 source indices, and [m] int32 true counts.
 
-    If images must be told apart, n times the image code is added to the source index; unused slots are n·images. They are added
-    behind those of `old` rows and counts.
+    If images must be told apart, n times the image code is added to the source index.
     """
     engine = BlockSearch(candidates, cutoff, keep, tuning, slots=capacity, capacity=capacity)
     n, images = candidates.size, engine.images
     group = min(tuning.group, capacity)
     slots = lax.iota(jnp.int32, group)
 
-    def list_block(span: Span, old: list[Array]) -> list[Array]:
+    def list_block(span: Span, rows: list[Array]) -> list[Array]:
         def add(words: HitWords, found: tuple[Array, Array]) -> tuple[Array, Array]:
             (rows, count), (hits, _, image) = found, words
             bits = BitRows.of(hits, tuning.by_gathers)
@@ -91,22 +90,21 @@ def list_neighbors(
                 rows = put_group(*lax.fori_loop(begin, until, next_group, none))
             return rows, count + total
 
-        return [*engine.fold_words(span, add, (old[0], old[1]))]
+        return [*engine.fold_words(span, add, (rows[0], rows[1]))]
 
-    return engine.map_blocks(list_block, [jnp.full(capacity, n * images, jnp.int32), jnp.int32(0)], old)
+    return engine.map_blocks(list_block, state)
 
 
 def fill_neighbors(
-    candidates: Candidates, cutoff: Cutoff | Cutoffs, keep: Filter, room: Room, tuning: Tuning, old: list[Array] | None
+    candidates: Candidates, cutoff: Cutoff | Cutoffs, keep: Filter, room: Room, tuning: Tuning, state: list[Array]
 ) -> list[Array]:
-    """List the neighbors of every query in rows without gaps: [total] int32, as `list_neighbors` has them, 0 behind the last.
+    """Add the neighbors of every query to rows without gaps: [total] int32, as `list_neighbors` has them.
 
-    Returns also where the next one of each query would stand, [m] int32; `old` are both before.
+    The state holds these, and where the next neighbor of each query stands, [m] int32.
     """
     engine = BlockSearch(candidates, cutoff, keep, tuning, slots=FOLD_GROUP, capacity=None)
     n, images = candidates.size, engine.images
     slots = lax.iota(jnp.int32, FOLD_GROUP)
-    old = [jnp.zeros(room.total, jnp.int32), room.starts[:-1]] if old is None else old
 
     def fill_block(b: Array, state: list[Array]) -> list[Array]:
         span, (out, places) = engine.block(b), state
@@ -135,7 +133,7 @@ def fill_neighbors(
         out, at = engine.fold_words(span, add, (out, begin))
         return [out, places.at[jnp.where(fresh, ids, places.size)].set(at, mode="drop")]
 
-    return lax.fori_loop(0, engine.used_blocks, fill_block, old)
+    return lax.fori_loop(0, engine.used_blocks, fill_block, state)
 
 
 class Slots(NamedTuple):

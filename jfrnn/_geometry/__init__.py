@@ -3,7 +3,7 @@
 from jfrnn._geometry.batch import Batch, has_box, rank_systems
 from jfrnn._geometry.box import Box, round_box
 from jfrnn._geometry.box_cells import box_runs, most_cells, passes_of, sort_into_boxes
-from jfrnn._geometry.cell_line import FINE, CellLine, Cells, Sorting, line_runs, sort_along_line, sort_queries
+from jfrnn._geometry.cell_line import FINE, Cells, Sorting, line_runs, sort_along_line, sort_queries
 from jfrnn._geometry.cells import CellAxes, cell_edge, open_axes, ordered_bits
 from jfrnn._geometry.curves import hilbert_decode, hilbert_encode, morton_decode, morton_encode
 from jfrnn._geometry.cutoffs import (
