@@ -28,9 +28,9 @@ ENGINES: dict[str, Engine] = {
 # to 100 000 random points in 3D with 30 and 108 neighbors. On the CPU no engine is faster than Warp at any size: brute force is
 # level with it up to 32 points, 1.2x slower at 64; jax is 1.2x slower at 16, 3x at 256, 15x at 100 000. Warp compiles sooner too:
 # in 0.05 s instead of 1 to 3 s. On an H200 (16, 32 and 64 points measured) jax takes 1.8 to 2.1 times as long as Warp, brute force
-# 1.2 to 1.4 times; and Warp lists 250 000 points (experiments/results/h200) in less time than jax 64. On the CPU, Warp is per
-# particle 14 to 20 times as fast with a box or a batch, 4 to 26 times with a cutoff per particle (experiments/results/options:
-# cpu_warp.csv, cpu_jax.csv).
+# 1.2 to 1.4 times; and Warp lists 250 000 points (experiments/results/h200) in less time than jax 64. On the CPU, Warp lists
+# 3 to 9 times as many particles a second with a box or a batch, and 3 to 22 times with a cutoff per particle (196 times where ten
+# are far away): experiments/results/options, cpu_warp.csv of 100 000 points, cpu_jax.csv of 20 000.
 _WARP_FROM = {"cpu": 0, "gpu": 0}
 
 

@@ -200,9 +200,8 @@ def box_sums(search: Search, keep: Filter, summed: Summed, values: tuple[Array, 
 
     def on_cpu(search: Search, *values: Array) -> FoundSums:
         results, scratch = SumsOf(term, kind, m, pair_sum_cpu.slots(m)), _scratch_dims(search)
-        dims = (
-            results.dims() | {"columns": max(pair_sum_cpu.sorted_numbers(term, n, kind.dim, kind.double), 1), "info": 2} | scratch
-        )
+        columns = max(pair_sum_cpu.sorted_numbers(term, n, kind.dim, kind.double), 1)
+        dims = results.dims() | {"columns": columns, "info": 2} | scratch
         given = [*_particles(search), *beside_rows(term, values), *excluded_rows(search), *_cutoffs_of_particles(search)]
         return results.unpack(*_cpu_sum_callable(kind, term, key)(*given, output_dims=dims)[: len(SUMS)])
 

@@ -239,7 +239,7 @@ def _sum_callable(kind: ListKind, term: TermText, key: str) -> Call:
     return Call(f"jfrnn_kept_sums_{kind.call}_{key}", (*_LIST, "shared_values", "own_values"), results, plan)
 
 
-def _launch(kind: ListKind, found: Kernel, shapes: Shapes, _: int) -> Plan:
+def _launch(kind: ListKind, found: Kernel, shapes: Shapes) -> Plan:
     (m, capacity), n = shapes["idx"], shapes["points"][0] - 1
     m = shapes["rows"][0] if kind.reversed else m
     numbers = {"m": m, "n": n, "capacity": capacity, "images": kind.images, "closed": int(kind.kind.closed)}
@@ -247,17 +247,17 @@ def _launch(kind: ListKind, found: Kernel, shapes: Shapes, _: int) -> Plan:
     return Plan([launch] if kind.cuda else [Clear("info", 8), launch], numbers)
 
 
-def _plan_mask(kind: ListKind, shapes: Shapes, multiprocessors: int) -> Plan:
-    plan = _launch(kind, kept.mask_kernel(kind), shapes, multiprocessors)
+def _plan_mask(kind: ListKind, shapes: Shapes, _: int) -> Plan:
+    plan = _launch(kind, kept.mask_kernel(kind), shapes)
     if not kind.measured:
         return plan._replace(absent=["distances"])
     size = np.dtype(scalar_of(kind.kind)).itemsize * math.prod(shapes["distances"])
     return plan if kind.cuda else plan._replace(steps=[*ask_for_huge_pages("distances", size), *plan.steps])
 
 
-def _plan_slopes(kind: ListKind, shapes: Shapes, multiprocessors: int) -> Plan:
-    return _launch(kind, kept.slope_kernel(kind), shapes, multiprocessors)
+def _plan_slopes(kind: ListKind, shapes: Shapes, _: int) -> Plan:
+    return _launch(kind, kept.slope_kernel(kind), shapes)
 
 
-def _plan_sums(kind: ListKind, term: TermText, key: str, shapes: Shapes, multiprocessors: int) -> Plan:
-    return _launch(kind, kept.sum_kernel(kind, term, key), shapes, multiprocessors)
+def _plan_sums(kind: ListKind, term: TermText, key: str, shapes: Shapes, _: int) -> Plan:
+    return _launch(kind, kept.sum_kernel(kind, term, key), shapes)

@@ -100,8 +100,16 @@ def renew_list(inputs: Inputs, options: Options, kept: KeptRows, limit: np.float
     now, box, cutoff, ordered = inputs.sources, inputs.box, _one_cutoff(inputs), kept.order is not None
     (n, dim), dtype = now.shape, np.dtype(now.dtype)
     few, blocks = all_meet((n, n), False), renew.blocks(n)
-    flags = (True, cutoff.closed, options.filter.drop_self, options.filter.later_only)  # own, closed, drop_self and later
-    variant = Kind(dim, dtype == np.float64, False, *flags, lists=True, periodic=int(box is not None))
+    variant = Kind(
+        dim,
+        double=dtype == np.float64,
+        own=True,
+        closed=cutoff.closed,
+        drop_self=options.filter.drop_self,
+        later=options.filter.later_only,
+        lists=True,
+        periodic=int(box is not None),
+    )
     written: dict[str, Any] = dict(zip(_KEPT, kept[: len(_KEPT)], strict=True))
     made: dict[str, int | tuple[int, ...]] = {}
     operands = [now, jnp.full(1, limit, dtype)]
