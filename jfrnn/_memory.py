@@ -26,7 +26,7 @@ from jfrnn._engine import (
     list_rows,
     parse_backend,
 )
-from jfrnn._geometry import Cutoff, check_capacity, check_cutoff, check_flag, check_kind, check_size, check_skin
+from jfrnn._geometry import Cutoff, check_capacity, check_cutoff, check_flag, check_kind, check_size, check_skin, make_cutoff
 from jfrnn._search import check_total
 from jfrnn._sums import pair_sum
 from jfrnn._tracing import Flag, Given, Number, Real, Size, Tree
@@ -138,7 +138,7 @@ def memory_plan(
     """
     n, queries = check_size("n", n), None if queries is None else check_size("queries", queries)
     dim, dtype = check_kind(dim, dtype)
-    radius = check_cutoff(cutoff, dtype)
+    radius = make_cutoff(check_cutoff(cutoff, dtype), dtype, closed=False)
     rows = n if queries is None else queries
     where = default_platform() if platform is None else platform
     _check_parts(faces, queries, fn, capacity, gradient or values is not None)

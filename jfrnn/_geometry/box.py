@@ -10,9 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from jfrnn._geometry.reach import count_cells
-from jfrnn._geometry.reduced import short_vectors
-from jfrnn._tracing import Given, as_array, make_on_host, on_device, own_transfers
+from jfrnn._geometry.reduced import count_cells, short_vectors
+from jfrnn._tracing import Given, as_array, as_dtype, own_transfers
 
 _SINGULAR = 1e-9  # determinants below may be those of dependent rows
 Numbers = Any  # an array of NumPy or JAX, concrete or traced
@@ -294,9 +293,8 @@ def _per_axis(name: str, value: Given, dim: int, kinds: tuple[type, ...], what: 
 
 def check_box_values(box: Box) -> None:
     """Raise if known values are not those of a box, or of one per system."""
-    vectors, origin, flags = (
-        _known(x) for x in (box.vectors, box.origin, np.array(box.periodic) if box.flags is None else box.flags)
-    )
+    given = box.vectors, box.origin, box.periodic if box.flags is None else box.flags
+    vectors, origin, flags = (x if isinstance(x, Tracer) else np.asarray(x) for x in given)
     for name, value in (("lengths_or_matrix", vectors), ("origin", origin)):
         if not isinstance(value, Tracer) and not np.isfinite(value).all():
             raise ValueError(f"{name} must be finite, got {_tell_bad(value, ~np.isfinite(value), box)}.")
@@ -317,23 +315,12 @@ def check_box_values(box: Box) -> None:
         raise ValueError(f"periodic lattice vectors must be linearly independent, got the rows {_tell_bad(vectors, bad, box)}.")
 
 
-def _known(x: Numbers) -> Numbers:
-    return x if isinstance(x, Tracer) else np.asarray(x)
-
-
 def _tell_bad(values: np.ndarray, bad: np.ndarray, box: Box) -> str:
     """Return values as text; with a box per system those of the first bad one."""
     if not box.per_system:
         return str(values.tolist())
     first = int(np.argmax(bad.reshape(len(bad), -1).any(axis=1)))
     return f"{values[first].tolist()} in system {first}"
-
-
-def _rounded(x: Numbers, dtype: np.dtype) -> Numbers:
-    """Return an array of a dtype on the device; of concrete numbers it is made without a program for their shape."""
-    if isinstance(x, Tracer):
-        return x.astype(dtype)
-    return on_device(x) if x.dtype == dtype else make_on_host(x, lambda known: known.astype(dtype))
 
 
 def searched_vectors(box: Box, dtype: np.dtype) -> np.ndarray:
@@ -345,7 +332,5 @@ def searched_vectors(box: Box, dtype: np.dtype) -> np.ndarray:
 def round_box(box: Box, dtype: np.dtype) -> Box:
     """Return a box with its arrays rounded to a dtype."""
     with own_transfers():
-        floats = (_rounded(x, dtype) for x in (box.vectors, box.origin))
-        flags = None if box.flags is None else _rounded(box.flags, np.dtype(bool))
-        arrays = (*floats, flags, None if box.numbers is None else _rounded(box.numbers, dtype))
-        return Box.tree_unflatten(box.kind, arrays)
+        given = ((box.vectors, dtype), (box.origin, dtype), (box.flags, np.dtype(bool)), (box.numbers, dtype))
+        return Box.tree_unflatten(box.kind, [None if x is None else as_dtype(x, kind) for x, kind in given])

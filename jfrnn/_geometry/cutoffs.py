@@ -10,7 +10,6 @@ import numpy as np
 from jax import Array, lax
 
 from jfrnn._geometry.floats import two_sum, unit_scale
-from jfrnn._geometry.integers import limb_type
 
 Flags = Any  # bool array of NumPy or JAX, like the argument
 RULES = ("gather", "scatter", "either", "both", "mean")  # cutoff of a pair: i's, j's, larger, smaller, mean
@@ -149,7 +148,7 @@ def is_radius(radii: Array | np.ndarray) -> Flags:
     """Say which cutoffs the pair test can decide; 0 is valid: it finds coincident particles. NumPy input gives NumPy output."""
     dtype = np.dtype(radii.dtype)
     unsigned = np.uint32 if dtype == np.float32 else np.uint64  # bits are compared: as floats, denormals would be flushed to 0
-    low, high = (np.array(x, dtype).view(unsigned)[()] for x in (smallest_cutoff(dtype), largest_cutoff(dtype)))
+    low, high = (np.array(x, dtype).view(unsigned)[()] for x in cutoff_range(dtype))
     bits = radii.view(unsigned) if isinstance(radii, np.ndarray) else lax.bitcast_convert_type(radii, unsigned)
     magnitude = bits << unsigned(1) >> unsigned(1)
     negative_zero = np.array(-0.0, dtype).view(unsigned)[()]
@@ -157,31 +156,25 @@ def is_radius(radii: Array | np.ndarray) -> Flags:
 
 
 def make_cutoff(value: float, dtype: np.dtype, closed: bool) -> Cutoff:
-    """Round a cutoff between `smallest_cutoff` and `largest_cutoff` to a dtype and derive the constants of the pair test."""
+    """Round a cutoff within `cutoff_range` to a dtype and derive the constants of the pair test."""
     finfo = np.finfo(dtype)
     narrow = dtype == np.float32
     radius = dtype.type(value)
     exponent = int(np.frexp(radius)[1]) - 1
     unit_scale = dtype.type(2.0 ** -min(exponent, -int(finfo.minexp)))
     scaled = abs(exponent) > (30 if narrow else 400)
-    square = (radius * unit_scale if scaled else radius) ** 2
+    square, units = (radius * unit_scale if scaled else radius) ** 2, UNITS[dtype.itemsize]
+    number = int(float(radius) * float(unit_scale) * 2.0 ** (units.upper + 2 * units.limb)) ** 2  # r² in the units of step 2
+    limbs = [number >> (units.limb * k) & ((1 << units.limb) - 1) for k in range(6)] + [number >> (units.limb * 6)]
     return Cutoff(
         radius=radius,
         inside=square * dtype.type(1 - 8 * finfo.eps),
         outside=square * dtype.type(1 + 8 * finfo.eps),
         unit_scale=unit_scale,
-        less=-_limbs_of_square(radius, unit_scale),
+        less=-np.array(limbs, np.int32 if narrow else np.int64),
         closed=closed,
         scaled=scaled,
     )
-
-
-def _limbs_of_square(radius: np.floating, scale: np.floating) -> np.ndarray:
-    """Return the limbs of r² in the units of step 2, the lowest first."""
-    units = UNITS[radius.dtype.itemsize]
-    number = int(float(radius) * float(scale) * 2.0 ** (units.upper + 2 * units.limb)) ** 2
-    limbs = [number >> (units.limb * k) & ((1 << units.limb) - 1) for k in range(6)] + [number >> (units.limb * 6)]
-    return np.array(limbs, limb_type(radius.dtype))
 
 
 def make_cutoffs(radii: Radii, closed: bool, skin: float = 0.0) -> Cutoffs:
@@ -266,12 +259,7 @@ def _bounds_of_pairs(cutoffs: Cutoffs, radii: list[Array], slack: Array | None =
     return inside, outside
 
 
-def smallest_cutoff(dtype: np.dtype) -> float:
-    """Return the smallest cutoff for which flushed denormals stay within the band of step 1."""
+def cutoff_range(dtype: np.dtype) -> tuple[float, float]:
+    """Return the smallest cutoff whose band of step 1 covers flushed denormals, and the largest whose cell edge is finite."""
     finfo = np.finfo(dtype)
-    return 2.0 ** (finfo.minexp + finfo.nmant + 7)
-
-
-def largest_cutoff(dtype: np.dtype) -> float:
-    """Return the largest cutoff whose cell edge is finite."""
-    return 2.0 ** (np.finfo(dtype).maxexp - 1)
+    return 2.0 ** (finfo.minexp + finfo.nmant + 7), 2.0 ** (finfo.maxexp - 1)

@@ -93,3 +93,11 @@ def _rounded_product_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Ar
 def _plain_product(points: Array, matrix: Array) -> Array:
     """Return points @ matrix, without a matmul, which GPUs may compute in fewer bits."""
     return functools.reduce(jnp.add, (points[:, k, None] * matrix[..., k, :] for k in range(points.shape[1])))
+
+
+def ordered_bits(x: Array) -> Array:
+    """Map floats to unsigned integers so that the order is kept."""
+    unsigned = jnp.uint32 if x.dtype == jnp.float32 else jnp.uint64
+    top = unsigned(1 << (32 if x.dtype == jnp.float32 else 64) - 1)
+    bits = lax.bitcast_convert_type(x, unsigned)
+    return jnp.where(bits >= top, ~bits, bits | top)

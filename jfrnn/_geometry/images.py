@@ -13,8 +13,7 @@ import numpy as np
 from jax.core import Tracer
 
 from jfrnn._geometry.box import Box, check_box_values, searched_vectors
-from jfrnn._geometry.reach import count_cells
-from jfrnn._geometry.reduced import Basis, reduced_basis
+from jfrnn._geometry.reduced import Basis, count_cells, reduced_basis
 from jfrnn._geometry.status import Status
 from jfrnn._tracing import own_transfers
 
@@ -86,10 +85,12 @@ def images_of(box: Box, radius: float | None, dtype: np.dtype, sources: int) -> 
     if box.images is None and radius is not None and not isinstance(box.vectors, Tracer) and not isinstance(box.flags, Tracer):
         with own_transfers():
             images = _needed_images(searched_vectors(box, dtype), box, radius, dtype, None)
-        if not (box.orthogonal or box.per_system) and _too_many(images, sources, _MANY_IMAGES):
+        many = images.total > _MANY_IMAGES or (not images.nearest and sources * images.total >= 2**31)
+        if many and not (box.orthogonal or box.per_system):
             basis, short = reduced_basis(searched_vectors(box, dtype), box.periodic)
             reduced = _needed_images(short, box, radius, dtype, basis)
-            images = reduced if reduced.total < images.total and _are_exact(reduced) else images
+            numbers = (2 * LARGEST_TURN + max(reduced.reach)) * np.abs(reduced.numbers).sum(axis=0)  # of given vectors in a shift
+            images = reduced if reduced.total < images.total and numbers.max() <= _MOST_VECTORS else images
         return check_images(images, sources)
     wanted = box.images or box.images_of_list or (0,) * box.dim
     nearest = not any(k for k, p in zip(wanted, box.periodic, strict=True) if p)
@@ -131,15 +132,6 @@ def _needed_images(vectors: np.ndarray, box: Box, radius: float, dtype: np.dtype
     flags = np.array(box.periodic) if box.flags is None else np.asarray(box.flags)
     reach, nearest = count_cells(vectors, flags, box.orthogonal, radius, dtype)
     return Images(box.periodic, box.orthogonal, reach, nearest, basis, box.per_system, box.numbers is not None)
-
-
-def _too_many(images: Images, sources: int, most: int) -> bool:
-    return images.total > most or (not images.nearest and sources * images.total >= 2**31)
-
-
-def _are_exact(images: Images) -> bool:
-    """Say whether shifts in the given vectors are whole numbers that every dtype holds exactly."""
-    return (2 * LARGEST_TURN + max(images.reach)) * np.abs(images.numbers).sum(axis=0).max() <= _MOST_VECTORS
 
 
 def check_images(images: Images, sources: int) -> Images:

@@ -1,7 +1,7 @@
 """Argument checks while tracing: each error names the argument, what it was, what was expected and what to do."""
 
 import math
-from numbers import Integral, Real
+from numbers import Real
 from typing import Any
 
 import jax
@@ -12,22 +12,25 @@ from jax.core import Tracer
 
 from jfrnn._geometry.batch import Batch
 from jfrnn._geometry.box import Box
-from jfrnn._geometry.cutoffs import RULES, SUM, TABLE, Cutoff, Radii, is_radius, largest_cutoff, make_cutoff, smallest_cutoff
-from jfrnn._tracing import Given, as_array, default_float, gather, make_on_host, on_device, refuse_forks
+from jfrnn._geometry.cutoffs import RULES, SUM, TABLE, Radii, cutoff_range, is_radius
+from jfrnn._tracing import Given, as_array, as_dtype, gather, make_on_host, on_device, refuse_forks
 
 _MOST_POINTS = 2**31 - 32
 _MOST_KINDS = 2**12  # places in a table of their cutoffs are whole floats, too
 
 
-def check_positions(name: str, positions: Given, like: Array | None = None) -> Array:
-    """Return positions as a float32 or float64 array [n, 2] or [n, 3]; with `like`, of the same dtype and dimension."""
+def check_positions(name: str, positions: Given, like: Array | None = None, numbers: np.dtype | type[float] = float) -> Array:
+    """Return positions as a float32 or float64 array [n, 2] or [n, 3]; with `like`, of the same dtype and dimension.
+
+    A list of numbers becomes an array of the dtype `numbers`, or that of `like`.
+    """
     refuse_forks()
     if hasattr(positions, "positions"):
         raise TypeError(
             f"{name} must be a JAX or NumPy array of shape [n, 2] or [n, 3], got {type(positions).__name__}, which has one: pass "
             f"atoms.positions, with a cell box=jfrnn.Box(atoms.cell[:], periodic=atoms.pbc), or call jfrnn.ase.neighbor_list."
         )
-    positions = as_array(name, positions, default_float() if like is None else np.dtype(like.dtype))
+    positions = as_array(name, positions, numbers if like is None else np.dtype(like.dtype))
     if not hasattr(positions, "dtype") or not hasattr(positions, "shape"):
         raise TypeError(
             f"{name} must be a JAX or NumPy array of shape [n, 2] or [n, 3], got {type(positions).__name__}: "
@@ -44,7 +47,6 @@ def check_positions(name: str, positions: Given, like: Array | None = None) -> A
     if len(shape) != 2 or shape[1] not in (2, 3):
         turned = f": pass {name}.T" if len(shape) == 2 and shape[0] in (2, 3) else ""
         raise ValueError(f"{name} must have shape [n, 2] or [n, 3], one row per particle, got shape {list(shape)}{turned}.")
-    check_is_known(name, shape)
     if shape[0] > _MOST_POINTS:
         raise ValueError(f"{name} hold {shape[0]} particles, but indices are int32: at most {_MOST_POINTS}.")
     if like is not None and (dtype, shape[1]) != (like.dtype, like.shape[1]):
@@ -54,20 +56,9 @@ def check_positions(name: str, positions: Given, like: Array | None = None) -> A
     return on_device(positions)  # stays concrete inside jit, so that `search` can count its neighbors
 
 
-def check_is_known(name: str, shape: tuple[Any, ...]) -> None:
-    """Raise if a shape holds a symbol of `jax.export` in place of a number."""
-    symbols = [str(size) for size in shape if not isinstance(size, Integral)]
-    if symbols:
-        raise ValueError(
-            f"{name} must have a shape of numbers, got ({', '.join(map(str, shape))}): kernels and scratch are made for a number "
-            f"of rows, not for the symbol {symbols[0]}. Export one program for each number, or one for the most rows that come: "
-            "`search`, `count` and `pair_sum` take active= for those that are there."
-        )
-
-
 def check_again(name: str, positions: Given, dtype: np.dtype, dim: int, rows: int, what: str = "the list") -> Array:
     """Return positions, after checking that they have the dtype, dimension and number that e.g. a list was made for."""
-    points = check_positions(name, as_array(name, positions, np.dtype(dtype)))
+    points = check_positions(name, positions, numbers=np.dtype(dtype))
     if (points.dtype, points.shape[1]) != (dtype, dim):
         raise ValueError(
             f"{name} must be {dtype} with {dim} columns, for which {what} was made, got {points.dtype} with {points.shape[1]} "
@@ -94,7 +85,7 @@ def check_devices(name: str, given: Given, made: Given, what: str = "the list") 
     )
 
 
-def check_cutoff(cutoff: Given, dtype: np.dtype) -> Cutoff:
+def check_cutoff(cutoff: Given, dtype: np.dtype) -> float:
     """Return one cutoff for all particles, rounded to the dtype of the positions."""
     if isinstance(cutoff, Tracer):
         raise TypeError(
@@ -108,13 +99,13 @@ def check_cutoff(cutoff: Given, dtype: np.dtype) -> Cutoff:
     value = float(cutoff)
     if not (math.isfinite(value) and value > 0):
         raise ValueError(f"cutoff must be positive and finite, got {value}.")
-    low, high = smallest_cutoff(dtype), largest_cutoff(dtype)
+    low, high = cutoff_range(dtype)
     if not low <= value <= high:
         raise ValueError(
             f"cutoff={value} is outside [{low:.1e}, {high:.1e}], the range in which {dtype} decides pairs exactly: "
             "choose another unit of length, or float64."
         )
-    return make_cutoff(value, dtype, closed=False)
+    return float(dtype.type(value))
 
 
 def check_radii(cutoff: Given, rule: object, sources: Array, queries: Array | None) -> Radii | None:
@@ -156,8 +147,9 @@ def _check_radii_of(name: str, radii: Given, size: int, what: str, like: Array, 
     if tuple(radii.shape) != (size,):
         raise ValueError(f"{name} must be a number, or have shape [{size}], one per {what}, got shape {list(radii.shape)}.")
     if doubled and not isinstance(radii, Tracer):
-        return make_on_host(radii, lambda known: _double(known.astype(like.dtype)))
-    radii = _as_dtype(radii, like.dtype)
+        with np.errstate(over="ignore"):  # a status bit tells of cutoffs that are not finite
+            return make_on_host(radii, lambda known: 2 * known.astype(like.dtype))
+    radii = as_dtype(radii, like.dtype)
     return 2 * radii if doubled else radii
 
 
@@ -197,7 +189,7 @@ def check_table(cutoff: Given, like: Array, kinds: int | None = None) -> Array:
         )
     if cutoff.shape[0] > _MOST_KINDS:
         raise ValueError(f"cutoff holds cutoffs of {cutoff.shape[0]} species: at most {_MOST_KINDS}.")
-    table = _as_dtype(cutoff, like.dtype)
+    table = as_dtype(cutoff, like.dtype)
     if isinstance(table, Tracer):
         return table
     known: Any = np.asarray(jax.device_get(table))
@@ -221,25 +213,13 @@ def _check_kinds(name: str, species: Array, kinds: int) -> None:
         raise ValueError(f"{name} must be numbers of species from 0 to {kinds - 1}, the rows of cutoff, got {wrong[0]}.")
 
 
-def _double(radii: np.ndarray) -> np.ndarray:
-    with np.errstate(over="ignore"):  # a status bit tells of cutoffs that are not finite
-        return radii + radii
-
-
-def _as_dtype(x: Given, dtype: np.dtype) -> Array:
-    """Convert an array; a concrete one on the host, so that no program is compiled for its shape."""
-    if isinstance(x, Tracer):
-        return gather(x).astype(dtype)
-    return on_device(x) if x.dtype == dtype else make_on_host(x, lambda known: known.astype(dtype))
-
-
 def largest_known(radii: Radii) -> float | None:
     """Return the largest valid cutoff, or 1 if none is valid; None if cutoffs are traced."""
     given = [x for x in (radii.sources, radii.queries) if x is not None] if radii.table is None else [radii.table.reshape(-1)]
     if any(isinstance(x, Tracer) for x in given):
         return None
     values: Any = np.concatenate(jax.device_get(given))
-    low, high = smallest_cutoff(values.dtype), largest_cutoff(values.dtype)
+    low, high = cutoff_range(values.dtype)
     return float(np.max(values[(values >= low) & (values <= high)], initial=0)) or 1.0
 
 
@@ -247,8 +227,8 @@ def check_skin(skin: object, cutoff: float, dtype: np.dtype) -> float:
     """Return a static skin, rounded to the dtype of the positions; 0 means no skin."""
     if isinstance(skin, Tracer | bool) or not isinstance(skin, int | float | np.number):
         raise TypeError(f"skin must be a number known while tracing, got {_describe(skin)}.")
-    value = float(dtype.type(skin))
-    low, high = 2 * smallest_cutoff(dtype), largest_cutoff(dtype) - cutoff
+    value, (least, most) = float(dtype.type(skin)), cutoff_range(dtype)
+    low, high = 2 * least, most - cutoff
     if not (value == 0 or low <= value <= high):
         raise ValueError(
             f"skin={float(skin)} must be 0 (no skin) or between {low:.1e} and {high:.1e}, so that {dtype} can tell whether a "
@@ -296,7 +276,7 @@ def _check_numbers(name: str, of: str, systems: Given, size: int, what: str) -> 
     if tuple(systems.shape) != (size,):
         raise ValueError(f"{name} must have shape [{size}], the {of} of each {what}, got shape {list(systems.shape)}.")
     if np.can_cast(systems.dtype, np.int32):
-        return _as_dtype(systems, jnp.int32), None
+        return as_dtype(systems, np.dtype(np.int32)), None
     most = np.iinfo(np.int32).max
     if isinstance(systems, Tracer):
         systems = gather(systems)

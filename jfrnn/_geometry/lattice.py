@@ -79,15 +79,11 @@ def make_lattice(box: Box, images: Images, dtype: np.dtype) -> Lattice:
     if not box.per_system:
         matrix, given, transform = _make(vectors, None, None, box, images)
         made = Lattice(matrix, given, transform, origin, None, images)
-        return dataclasses.replace(made, origin=_bring_origins_near(origin[None], made)[0])
+        return dataclasses.replace(made, origin=_look_whether_far(origin[None], made).points[0])
     numbers = None if box.numbers is None or not images.short else lax.stop_gradient(jnp.asarray(box.numbers).astype(dtype))
-
-    def of_system(vectors: Array, flags: Array | None, numbers: Array | None) -> tuple[Array, Array, Array]:
-        return _make(vectors, flags, numbers, box, images)
-
-    matrix, given, transform = jax.vmap(of_system)(vectors, box.flags, numbers)
+    matrix, given, transform = jax.vmap(functools.partial(_make, box=box, images=images))(vectors, box.flags, numbers)
     made = Lattice(matrix, given, transform, origin, None if box.flags is None else jnp.asarray(box.flags), images)
-    return dataclasses.replace(made, origin=_bring_origins_near(origin, made))
+    return dataclasses.replace(made, origin=_look_whether_far(origin, made).points)
 
 
 def _make(vectors: Array, flags: Array | None, numbers: Array | None, box: Box, images: Images) -> tuple[Array, Array, Array]:
@@ -150,19 +146,24 @@ def _inverse(matrix: Array) -> Array:
     """Invert a [d, d] matrix by cofactors of its scaled rows, followed by one Newton step."""
     size = largest_component(jnp.abs(matrix))[:, None]
     rows = matrix / size
-    if len(matrix) == 2:
-        adjugate = jnp.stack([jnp.stack([rows[1, 1], -rows[0, 1]]), jnp.stack([-rows[1, 0], rows[0, 0]])])
-    else:
-        adjugate = jnp.stack([jnp.cross(rows[k - 2], rows[k - 1]) for k in range(3)], axis=1)
-    inverse = adjugate / add_rows((rows[0] * adjugate[:, 0])[:, None])[0]
+    cofactors = adjugate(rows)
+    inverse = cofactors / add_rows((rows[0] * cofactors[:, 0])[:, None])[0]
     inverse = product(inverse, 2 * jnp.eye(len(rows), dtype=rows.dtype) - product(rows, inverse))
     return inverse / size.T
 
 
+def adjugate(matrix: Array) -> Array:
+    """Return the transposed cofactors of [..., d, d]."""
+    rows = [matrix[..., k, :] for k in range(matrix.shape[-1])]
+    if len(rows) == 2:
+        (a, b), (c, d) = ((row[..., 0], row[..., 1]) for row in rows)
+        return jnp.stack([jnp.stack([d, -b], axis=-1), jnp.stack([-c, a], axis=-1)], axis=-2)
+    return jnp.stack([jnp.cross(rows[k - 2], rows[k - 1]) for k in range(3)], axis=-1)
+
+
 def _diagonal(matrix: Array) -> Array:
-    return jnp.stack(
-        [matrix[..., k, k] for k in range(matrix.shape[-1])], axis=-1
-    )  # without a gather, which would be a separate kernel
+    columns = [matrix[..., k, k] for k in range(matrix.shape[-1])]  # without a gather, which would be a separate kernel
+    return jnp.stack(columns, axis=-1)
 
 
 def product(a: Array, b: Array) -> Array:
@@ -272,13 +273,11 @@ def bring_near(points: Array, lattice: Lattice) -> Near:
     return _look_whether_far(points, lattice)
 
 
-def _bring_origins_near(origins: Array, lattice: Lattice) -> Array:
-    """Move far origins [n, d] near 0. XLA would compute this on a CPU for every particle anew, were it not behind a condition."""
-    return _look_whether_far(origins, lattice).points
-
-
 def _look_whether_far(points: Array, lattice: Lattice) -> Near:
-    """Bring points near behind a condition on a CPU, where that is worth it."""
+    """Bring points near behind a condition on a CPU, where that is worth it.
+
+    A far origin is brought near 0 so: XLA would compute this for every particle anew, were it not behind a condition.
+    """
     if lattice.images.counts_short:
         return Near(points, jnp.zeros_like(points))
     return on_platform(points, lattice, cpu=_bring_near_if_any_is_far, default=_bring_each_near)

@@ -5,7 +5,7 @@ import numpy as np
 from jax import Array
 from jax.core import Tracer
 
-from jfrnn._tracing import Given, IndexRows, Points, as_array, default_float, on_device, own_transfers
+from jfrnn._tracing import Given, IndexRows, Points, as_array, on_device, own_transfers
 
 
 def merge_vertices(vertices: Points, faces: IndexRows) -> tuple[Array, Array]:
@@ -52,7 +52,7 @@ def merge_vertices(vertices: Points, faces: IndexRows) -> tuple[Array, Array]:
 
 
 def _check_mesh(vertices: Given, faces: Given) -> tuple[np.ndarray, np.ndarray]:
-    points = np.asarray(jax.device_get(as_array("vertices", vertices, default_float())))
+    points = np.asarray(jax.device_get(as_array("vertices", vertices, float)))
     named = np.asarray(jax.device_get(as_array("faces", faces)))
     if points.dtype not in (np.float32, np.float64):
         raise TypeError(f"vertices must be float32 or float64, got {points.dtype}.")

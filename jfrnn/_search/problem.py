@@ -140,7 +140,7 @@ def check_problem(asked: Asked) -> tuple["Problem", Inputs]:
     keep, closed = Filter(drop_self, later_only=check_flag("half", asked.half)), check_flag("closed", asked.closed)
     radii = _check_cutoffs(asked, sources, queries, keep)
     excluded = None if asked.exclude is None else check_exclusions(asked.exclude, sources, queries)
-    radius = float(check_cutoff(asked.cutoff, dtype).radius) if radii is None else None
+    radius = check_cutoff(asked.cutoff, dtype) if radii is None else None
     largest = radius if radii is None else largest_known(radii)
     skin = check_skin(asked.skin, largest or 0.0, dtype)
     reach = None if largest is None else list_radius(largest, skin, dtype)

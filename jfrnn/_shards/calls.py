@@ -37,7 +37,7 @@ def check_asked(particles: object, cutoff: Given, skin: object, include_self: ob
         raise TypeError(f"particles must be what jfrnn.distributed.scatter returns, got {type(particles).__name__}.")
     parse_backend(backend, BACKENDS, " on several devices")
     dtype = np.dtype(particles.positions.dtype)
-    radius = float(check_cutoff(cutoff, dtype).radius)
+    radius = check_cutoff(cutoff, dtype)
     skin = check_skin(skin, radius, dtype)
     if list_radius(radius, skin, dtype) > particles.reach:
         raise ValueError(

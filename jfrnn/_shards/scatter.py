@@ -15,7 +15,7 @@ from jfrnn._geometry import Box, check_box, check_cutoff, check_positions, check
 from jfrnn._search import list_radius
 from jfrnn._shards.migrate import migrate
 from jfrnn._shards.particles import Particles, Sizes, no_requirements, place_rows, replicate, resize, room
-from jfrnn._tracing import Given, Number, Points, Real, Tree, as_array, default_float
+from jfrnn._tracing import Given, Number, Points, Real, Tree, as_array
 
 _MOST = 2**31 - 1
 _SMALL = 1024  # particles per message for which the first guess leaves room: a wrong guess costs a compilation
@@ -55,7 +55,7 @@ def scatter(
     """
     if any(isinstance(x, Tracer) for x in jax.tree.leaves((positions, values, box))):
         raise TypeError("scatter() chooses shapes from data and cannot run inside jax.jit: call it before, on arrays.")
-    positions = as_array("positions", positions, default_float())
+    positions = as_array("positions", positions, float)
     check_positions("positions", positions[:0] if hasattr(positions, "shape") and np.ndim(positions) else positions)
     x = np.asarray(positions)
     if len(x) > _MOST:
@@ -132,7 +132,7 @@ def _check_value(path: KeyPath, leaf: Given, total: int) -> np.ndarray:
 
 
 def _check_reach(cutoff: Given, skin: object, dtype: np.dtype) -> float:
-    radius = float(check_cutoff(cutoff, dtype).radius)
+    radius = check_cutoff(cutoff, dtype)
     return list_radius(radius, check_skin(skin, radius, dtype), dtype)
 
 

@@ -137,7 +137,7 @@ def _batch(args: tuple, dims: tuple, **params: Internal) -> tuple[list[Array], l
 
 
 def _lower(ctx: Internal, *args: Internal, **params: Internal) -> Internal:
-    """Trace the sums as on a single device; see `jfrnn._tracing.manual`."""
+    """Trace the sums as on a single device; see `jfrnn._tracing.late`."""
     return lower_sum(lower_late(_sums), ctx.replace(avals_in=unvarying_types(ctx.avals_in)), *args, **params)
 
 

@@ -2,24 +2,30 @@
 
 from jfrnn._tracing.arguments import (
     AnyCutoff,
+    Aval,
     Backend,
     Flag,
     Flags,
+    Given,
     IndexRows,
     Indices,
+    Internal,
     Number,
     Numbers,
     Points,
     RadiusRule,
     Real,
     Size,
+    Tree,
     as_array,
-    default_float,
+    as_dtype,
+    at_once,
+    gather,
+    make_on_host,
+    on_device,
+    own_transfers,
+    refuse_forks,
 )
 from jfrnn._tracing.flags import first_set, largest_of, set_places
-from jfrnn._tracing.forks import refuse_forks
-from jfrnn._tracing.kinds import Aval, Given, Internal, Tree
-from jfrnn._tracing.late import call_late, lower_late, on_platform
-from jfrnn._tracing.manual import call_apart, result_aval, unvarying_types, vary, varying_axes
-from jfrnn._tracing.modes import gather, own_transfers
-from jfrnn._tracing.programs import at_once, compile_program, make_on_host, on_device
+from jfrnn._tracing.late import call_apart, call_late, lower_late, on_platform, result_aval, unvarying_types, vary, varying_axes
+from jfrnn._tracing.programs import compile_program

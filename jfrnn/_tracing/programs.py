@@ -10,19 +10,12 @@ import ctypes
 import functools
 import mmap
 from collections.abc import Callable
-from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, Generic, ParamSpec, TypeVar
 
 import jax
-import jax.core
-import jax.numpy as jnp
-import numpy as np
-from jax import Array
-from jax.core import Tracer
 
-from jfrnn._tracing.kinds import Given, Tree
-from jfrnn._tracing.modes import gather, guards_transfers, own_transfers
+from jfrnn._tracing.arguments import Tree
 
 MOST = 512  # most programs of all functions together
 _LOOK_EVERY = 8  # new programs between looks at the memory and its maps, which take 1 to 20 ms; compiling takes a second
@@ -41,7 +34,10 @@ _before: int | None = None  # what was resident when programs were last dropped,
 
 
 class Program(Generic[_Args, _Result]):
-    """A compiled function; the library bounds the number of programs of all such functions together."""
+    """A compiled function, as `jax.jit` makes it; all programs of the library are dropped if there are too many.
+
+    Programs in use elsewhere, such as a program of the caller that calls this function, are not affected.
+    """
 
     def __init__(self, function: Callable[_Args, _Result], **options: Option) -> None:
         self._function, self._options, self.calls = function, options, 0
@@ -74,27 +70,17 @@ class Program(Generic[_Args, _Result]):
         self._jitted.clear_cache()
         self._jitted, self.calls = self._compile_anew(), 0
 
-    @property
-    def is_reused(self) -> bool:
-        """Whether its programs have been called several times each, since it was last cleared."""
-        return self.calls >= _USES * self.cache_size()
-
     def lower(self, *args: Tree, **kwargs: Tree) -> Lowered:
         """Lower like a jitted function; arguments may be shapes instead of arrays."""
         return self._jitted.lower(*args, **kwargs)
 
 
-def compile_program(function: Callable[_Args, _Result], **options: Option) -> Program[_Args, _Result]:
-    """Compile a function like `jax.jit`, and drop all programs of the library if there are too many.
-
-    Programs in use elsewhere, such as a program of the caller that calls this function, are not affected.
-    """
-    return Program(function, **options)
+compile_program = Program  # as functions are decorated with it
 
 
 def program_count() -> int:
     """Return the number of compiled programs that the library holds."""
-    return sum(function.cache_size() for function in _functions)
+    return sum(function._jitted._cache_size() for function in _functions)
 
 
 def clear_programs(reused: bool = True) -> None:
@@ -103,19 +89,10 @@ def clear_programs(reused: bool = True) -> None:
     Without `reused`, those stay whose functions call each of their programs several times, as in a loop over steps.
     """
     for function in _functions:
-        if reused or not function.is_reused:
+        if reused or function.calls < _USES * function.cache_size():
             function.clear_cache()
-    trim = _trim()
-    if trim is not None:
-        trim(0)
-
-
-@functools.cache
-def _trim() -> Callable[[int], int] | None:
-    """Return the function of glibc that gives freed memory back to the system; None with other C libraries."""
-    with contextlib.suppress(OSError, AttributeError):
-        return ctypes.CDLL(None).malloc_trim
-    return None
+    with contextlib.suppress(OSError, AttributeError):  # other C libraries than glibc have no such function
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 class _WithOthers:
@@ -129,47 +106,6 @@ class _WithOthers:
 
     def cache_keys(self) -> list[Any]:
         return []
-
-
-def _clear_with_others() -> _WithOthers | None:
-    """Have `jax.clear_caches` clear the programs of the library; None where this JAX keeps no list of caches."""
-    with contextlib.suppress(ImportError, AttributeError, TypeError):
-        from jax._src.util import register_cache
-
-        cache = _WithOthers()
-        register_cache(cache, "programs of jfrnn")
-        return cache
-    return None
-
-
-def at_once() -> AbstractContextManager[None]:
-    """Evaluate calls with concrete arrays immediately, even while tracing, with the programs of eager calls.
-
-    `jax.ensure_compile_time_eval` would also evaluate constants inside these programs operation by operation, each of which is
-    compiled for each shape.
-    """
-    return jax.core.eval_context()
-
-
-def on_device(x: Given) -> Array:
-    """Return `jnp.asarray(x)`, replicated if it is sharded over explicit mesh axes, and concrete if x is.
-
-    NumPy arrays are transferred without the program that `jnp.asarray` compiles for each shape, unless a guard has to see the
-    transfer.
-    """
-    if isinstance(x, Tracer):
-        return gather(x)
-    with at_once():
-        if isinstance(x, Array):
-            return gather(jnp.asarray(x))
-        copied = np.array(x)  # JAX may share memory with this array, so it must not be the caller's
-        return jnp.asarray(copied) if guards_transfers() else jax.device_put(copied)
-
-
-def make_on_host(x: Given, how: Callable[[np.ndarray], np.ndarray]) -> Array:
-    """Return on the device what a NumPy function makes of a concrete array, so that no program is compiled for its shape."""
-    with own_transfers() if isinstance(x, Array) else contextlib.nullcontext():
-        return on_device(how(np.asarray(jax.device_get(x) if isinstance(x, Array) else x)))
 
 
 def _keep_bounded() -> None:
@@ -205,12 +141,12 @@ def _maps_are_scarce() -> bool:
         limit = int(Path("/proc/sys/vm/max_map_count").read_text())
         with Path("/proc/self/maps").open("rb") as maps:
             return sum(1 for _ in maps) > _SHARE * limit
-    except (
-        FileNotFoundError,
-        PermissionError,
-        ValueError,
-    ):  # not OSError: a handler of signals may raise TimeoutError, which is one
+    except (FileNotFoundError, PermissionError, ValueError):  # not OSError, one of which a handler of signals may raise
         return False
 
 
-_listed = _clear_with_others()
+_listed = _WithOthers()
+with contextlib.suppress(ImportError, AttributeError, TypeError):  # where this JAX keeps no list of caches
+    from jax._src.util import register_cache
+
+    register_cache(_listed, "programs of jfrnn")

@@ -7,7 +7,7 @@ from jax import Array
 from jax.core import Tracer
 
 from jfrnn._engine import ARRAYS, PLATFORMS, WARP, choose_engine, parse_backend, platform_of
-from jfrnn._geometry import check_capacity, check_cutoff, check_is_known, check_positions, check_slack
+from jfrnn._geometry import check_capacity, check_cutoff, check_positions, check_slack
 from jfrnn._tracing import Given, IndexRows, Number, Points, Real, Size, as_array, gather, make_on_host
 from jfrnn._triangles.engines import TRIANGLE_ENGINES, TriangleEngine, fastest_of
 from jfrnn._triangles.programs import count_slots, find_fields
@@ -67,7 +67,7 @@ def search_triangles(
     points = check_positions("positions", positions)
     corners = check_positions("vertices", vertices, like=points)
     named = _check_faces(faces, points.shape[1], corners.shape[0])
-    radius = float(check_cutoff(cutoff, np.dtype(points.dtype)).radius)
+    radius = check_cutoff(cutoff, np.dtype(points.dtype))
     engine, slack = _choose_engine(backend, points), check_slack(slack)
     if capacity is None:
         if any(isinstance(x, Tracer) for x in (points, corners, named)):
@@ -90,7 +90,6 @@ def _check_faces(faces: Given, dim: int, vertices: int) -> Array:
         raise TypeError(f"faces must be an array of integers of shape [f, {dim}], the vertices of {kind}, got {given}.")
     if len(faces.shape) != 2 or faces.shape[1] != dim:
         raise ValueError(f"faces must have shape [f, {dim}], the vertices of {kind} in {dim}D, got shape {list(faces.shape)}.")
-    check_is_known("faces", faces.shape)
     least = 0 if np.issubdtype(faces.dtype, np.unsignedinteger) else -1
     if isinstance(faces, Tracer):
         return _clip(gather(faces), least, vertices)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from jfrnn._geometry import cell_line
-from jfrnn._geometry.cells import CellAxes, cell_edge, open_axes
+from jfrnn._geometry.cell_line import CellAxes, cell_edge, open_axes
 from jfrnn._geometry.images import Images
 
 CUTOFF = 0.1

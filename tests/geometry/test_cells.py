@@ -6,8 +6,8 @@ import jax
 import numpy as np
 import pytest
 
-from jfrnn._geometry import cells as _cells
-from jfrnn._geometry.cutoffs import smallest_cutoff
+from jfrnn._geometry import cell_line as _cells
+from jfrnn._geometry.cutoffs import cutoff_range
 
 cell_edge, cell_coordinate = jax.jit(_cells.cell_edge), jax.jit(_cells.cell_coordinate)
 
@@ -71,5 +71,5 @@ def test_no_pair_is_two_cells_apart(dtype, cutoff, reach):
 
 def test_flushed_denormals_stay_within_the_edge_s_margin(dtype):
     """A negative denormal may count as 0 and land one cell up: the edge exceeds every cutoff by more than a denormal."""
-    cutoff = dtype(np.nextafter(dtype(2 * smallest_cutoff(np.dtype(dtype))), dtype(0)))
+    cutoff = dtype(np.nextafter(dtype(2 * cutoff_range(np.dtype(dtype))[0]), dtype(0)))
     assert Fraction(float(edge_of(cutoff, dtype))) - Fraction(float(cutoff)) > 2 * Fraction(float(np.finfo(dtype).tiny))

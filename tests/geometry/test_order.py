@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from jfrnn._geometry.curves import hilbert_decode, hilbert_encode, morton_decode, morton_encode
-from jfrnn._geometry.order import sort_order
-from jfrnn._geometry.tree_order import CLASSES, order_for_tree
+from jfrnn._geometry.order import CLASSES, order_for_tree, sort_order
 
 CURVES = {"morton": (morton_encode, morton_decode), "hilbert": (hilbert_encode, hilbert_decode)}
 MOST_BITS = {2: 31, 3: 21}
