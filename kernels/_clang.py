@@ -9,6 +9,7 @@ import importlib.util
 import os
 import re
 import sys
+import threading
 from pathlib import Path
 
 _NAMES = {"win32": ("warp.dll", "warp-clang.dll"), "darwin": ("libwarp.dylib", "libwarp-clang.dylib")}
@@ -19,6 +20,10 @@ NATIVE = ("-march=native",)
 OPTIONS = (*NATIVE, "-mllvm", "-inline-threshold=9000", "-mllvm", "-inline-cold-callsite-threshold=3000")
 OPTIONS += ("-mllvm", "-slp-recursion-max-depth=4")
 _COMPILED_WITH = (_TEXT, _TEXT, _TEXT, _TEXT, _FLAG, _FLAG, _FLAG, _FLAG, ctypes.c_void_p, _NUMBER, _FLAG, _FLAG, _TEXT, _NUMBER)
+# The lock of all that starts, compiles and lays plans, one thread at a time.
+one_at_a_time = threading.RLock()
+if hasattr(os, "register_at_fork"):  # a lock that another thread holds while a process forks would stay taken in the new one
+    os.register_at_fork(before=one_at_a_time.acquire, after_in_parent=one_at_a_time.release, after_in_child=one_at_a_time.release)
 
 
 @functools.cache

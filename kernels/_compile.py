@@ -11,6 +11,7 @@ import functools
 import hashlib
 import os
 import platform
+import re
 import shutil
 import sys
 import tempfile
@@ -23,9 +24,9 @@ from types import ModuleType
 from typing import Any
 
 from jfrnn.kernels import _clang, _driver
+from jfrnn.kernels._clang import one_at_a_time
 from jfrnn.kernels._program import Program
-from jfrnn.kernels._turns import one_at_a_time
-from jfrnn.kernels.launch import launcher
+from jfrnn.kernels._text import resolve
 
 Handle = Any  # of a program that is loaded, by Clang or by CUDA
 _FOLDER = "wp_jfrnn"
@@ -34,6 +35,17 @@ _DIGEST = 64  # hexadecimal digits
 _ROOM = 1 << 22  # bytes that a compiler may need
 _ATTEMPTS = 10
 Start = Callable[[], Any]
+# What C's own headers give to that of XLA.
+_TYPES = """typedef __SIZE_TYPE__ size_t;
+typedef __INT8_TYPE__ int8_t;
+typedef __INT32_TYPE__ int32_t;
+typedef __INT64_TYPE__ int64_t;
+typedef __UINT8_TYPE__ uint8_t;
+typedef __UINT32_TYPE__ uint32_t;
+typedef __UINT64_TYPE__ uint64_t;
+#define offsetof(type, member) __builtin_offsetof(type, member)
+"""
+notes: list[str] = []  # what users should be warned of, until they are
 _loaded: weakref.WeakValueDictionary[tuple[Program, str], "Library"] = weakref.WeakValueDictionary()
 
 
@@ -106,15 +118,6 @@ def load(program: Program, device: str = "cpu", start: Start = _start_warp) -> L
         return found
 
 
-_notes: list[str] = []
-
-
-def take_notes() -> list[str]:
-    """Return what users should be warned of since this was last asked."""
-    found, _notes[:] = list(_notes), []
-    return found
-
-
 def kernel_folder() -> Path:
     """Return the folder in which programs are kept, and in which Warp may keep its own."""
     return _folders()[-1]
@@ -131,9 +134,20 @@ def _folders() -> list[Path]:
     return [_clang.cache_folder()]
 
 
-def load_launcher(header: str) -> Library:
-    """Return what stands between XLA and the kernels (`jfrnn.kernels.launch`)."""
-    return load(launcher(header))
+def write_launcher(header: str, file: str = "launch.h") -> str:
+    """Return the text of the program that stands between XLA and all kernels (`native/launch/launch.h`), or of a file of it.
+
+    Args:
+        header: That of XLA's foreign function interface (`xla/ffi/api/c_api.h`).
+        file: A file of `kernels/native`.
+    """
+    interface = _TYPES + re.sub(r"^#include <.*>\n", "", header, flags=re.MULTILINE)
+    return resolve(file, given={"xla_ffi.h": interface})
+
+
+def launcher(header: str) -> Program:
+    """Return the program, with the functions `open_desk`, `answer_on_cpu`, `answer_on_cuda`, `keep_plan` and `drop_plan`."""
+    return Program("launch", write_launcher(header), cuda=False, inlined=False)  # it has no loop over pairs, and is waited for
 
 
 def find_binary(
@@ -157,7 +171,7 @@ def find_binary(
     try:
         return _compile(program, build, kept / name)
     except OSError:
-        _notes.append(temporary_folder())
+        notes.append(temporary_folder())
         return _compile(program, build, kernel_folder() / _FOLDER / name)
 
 

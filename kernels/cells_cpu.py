@@ -7,8 +7,7 @@ themselves chunks of places from an atomic counter (see `native/walk/walk_cpu.h`
 
 import functools
 
-from jfrnn.kernels._kind import Kind
-from jfrnn.kernels._native import declare_kind, place_parts, table_cells
+from jfrnn.kernels._native import Kind, declare_kind, place_parts, table_cells
 from jfrnn.kernels._program import Kernel
 
 CHUNK = 2048  # places that a thread takes at a time, where it puts them in order

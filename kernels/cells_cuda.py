@@ -17,8 +17,7 @@ crossing the same in a periodic box, for queries whose reach leaves it: images t
 import functools
 from typing import NamedTuple
 
-from jfrnn.kernels._kind import Kind
-from jfrnn.kernels._native import declare_kind, place_parts, table_cells
+from jfrnn.kernels._native import Kind, declare_kind, place_parts, table_cells
 from jfrnn.kernels._program import Entry, Kernel
 
 BLOCK = 256

@@ -6,8 +6,7 @@ a box that stands along the axes, and in which no pair has two images, the neare
 
 import functools
 
-from jfrnn.kernels._kind import Kind
-from jfrnn.kernels._native import declare_kind
+from jfrnn.kernels._native import Kind, declare_kind
 from jfrnn.kernels._program import Entry, Kernel
 from jfrnn.kernels.cells_cuda import GRID
 from jfrnn.kernels.pair_sum_cpu import TermText, constants_of, term_header

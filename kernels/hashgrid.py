@@ -19,8 +19,7 @@ import struct
 from typing import NamedTuple
 
 from jfrnn.kernels._clang import warp_root
-from jfrnn.kernels._kind import Kind
-from jfrnn.kernels._native import declare_kind
+from jfrnn.kernels._native import Kind, declare_kind
 from jfrnn.kernels._program import Entry, Kernel
 
 BLOCK = 128

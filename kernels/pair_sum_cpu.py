@@ -14,8 +14,7 @@ import re
 from typing import NamedTuple
 
 from jfrnn.kernels import tree_cpu
-from jfrnn.kernels._kind import Kind
-from jfrnn.kernels._native import declare_kind
+from jfrnn.kernels._native import Kind, declare_kind
 from jfrnn.kernels._program import Kernel
 from jfrnn.kernels.cells_cpu import CHUNK, GRID, QUERY_CHUNK, TOGETHER
 

@@ -21,8 +21,7 @@ many blocks then fit, and 12 % more instructions are executed: 0.59 to 0.65 ms, 
 import functools
 from typing import NamedTuple
 
-from jfrnn.kernels._kind import Kind
-from jfrnn.kernels._native import declare_kind
+from jfrnn.kernels._native import Kind, declare_kind
 from jfrnn.kernels._program import Entry, Kernel
 from jfrnn.kernels.cells_cuda import GRID, QUERY_BLOCK, Launch, query_blocks, walks
 from jfrnn.kernels.pair_sum_cpu import LITTLE_WORK, TermText, constants_of, term_header, work

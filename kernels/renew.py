@@ -3,8 +3,7 @@
 import functools
 from typing import NamedTuple
 
-from jfrnn.kernels._kind import Kind
-from jfrnn.kernels._native import program
+from jfrnn.kernels._native import Kind, program
 from jfrnn.kernels._program import Entry, Kernel, declare
 from jfrnn.kernels.cells_cuda import place_words
 

@@ -2,8 +2,7 @@
 
 import functools
 
-from jfrnn.kernels._kind import Kind
-from jfrnn.kernels._native import program
+from jfrnn.kernels._native import Kind, program
 from jfrnn.kernels._program import Entry, Kernel, declare
 
 ROWS_AT_ONCE = 64  # that a thread of the CPU takes

@@ -2,8 +2,7 @@
 
 import functools
 
-from jfrnn.kernels._kind import Kind
-from jfrnn.kernels._native import program
+from jfrnn.kernels._native import Kind, program
 from jfrnn.kernels._program import Kernel, declare
 
 INTS_PER_ATOM, REALS_PER_ATOM, MORE_INTS = 9, 6, 64  # of scratch

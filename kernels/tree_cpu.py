@@ -12,8 +12,7 @@ import functools
 import itertools
 
 from jfrnn.kernels import cells_cpu
-from jfrnn.kernels._kind import Kind
-from jfrnn.kernels._native import declare_kind, place_parts, table_cells
+from jfrnn.kernels._native import Kind, declare_kind, place_parts, table_cells
 from jfrnn.kernels._program import Kernel
 
 LEAF = 16  # sources of a leaf

@@ -10,8 +10,7 @@ Time follows pairs and particles: boxes are as small as 32 sources are close to 
 
 import functools
 
-from jfrnn.kernels._kind import Kind
-from jfrnn.kernels._native import declare_kind, place_parts
+from jfrnn.kernels._native import Kind, declare_kind, place_parts
 from jfrnn.kernels._program import Entry, Kernel
 from jfrnn.kernels.cells_cuda import BLOCK, GRID, HEADER_WORDS, QUERY_BLOCK, query_blocks, walking_blocks
 

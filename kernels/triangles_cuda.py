@@ -27,10 +27,9 @@ thread asks 16 boxes one after the other for each node (experiments/results/tria
 import functools
 from typing import NamedTuple
 
-from jfrnn.kernels._kind import Kind
-from jfrnn.kernels._native import place_parts, program
+from jfrnn.kernels._native import Kind, place_parts, program
 from jfrnn.kernels._program import Entry, Kernel, declare
-from jfrnn.kernels._triangles import constants, pending
+from jfrnn.kernels.triangles import constants, pending
 
 BLOCK = 256
 QUERY_BLOCK = 128

@@ -9,32 +9,30 @@ from jax import Array
 
 from jfrnn._engine.launch import Call, Shapes, kernel
 from jfrnn._engine.operands import (
-    as_float,
-    cutoffs_of_particles,
-    excluded_rows,
-    lattice_numbers,
-    particle_rows,
-    periodic_kind,
-)
-from jfrnn._engine.plans import Clear, Launch, Plan, share
-from jfrnn._engine.problem import Filter, Room, Rows, Search, largest_radius
-from jfrnn._engine.sum_results import FoundSums, Summed, SumsOf, beside_rows, numbers_of_values
-from jfrnn._engine.variants import (
     SUMS,
     absent,
+    as_float,
+    cutoffs_of_particles,
     describe_call,
     describe_sums,
+    excluded_rows,
     found_rows,
     huge_pages,
     kind_of_search,
+    lattice_numbers,
     names_of_cutoffs,
     names_of_particles,
+    particle_rows,
+    periodic_kind,
     plan_numbers,
     row_dims,
     scalar_of,
     size_numbers,
     sort_on_cpu,
 )
+from jfrnn._engine.plans import Clear, Launch, Plan, share
+from jfrnn._engine.problem import Filter, Room, Rows, Search, largest_radius
+from jfrnn._engine.sum_results import FoundSums, Summed, SumsOf, beside_rows, numbers_of_values
 from jfrnn._geometry import Cutoffs, Lattice, Wrapped, most_cells, unpack_turns
 from jfrnn._tracing import on_platform
 from jfrnn.kernels import Kind, boxes, cells_cpu, pair_sum_cpu, tree_cpu

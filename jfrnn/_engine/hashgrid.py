@@ -8,10 +8,10 @@ from collections.abc import Callable
 from typing import Any
 
 from jfrnn._engine.launch import Call, Shapes, kernel
+from jfrnn._engine.operands import absent, describe_call, huge_pages, plan_numbers
 from jfrnn._engine.plans import Clear, Kept, Launch, Plan
 from jfrnn._engine.problem import Features, Options, Room, Rows, Search
 from jfrnn._engine.start import INSTALL, load_warp
-from jfrnn._engine.variants import absent, describe_call, huge_pages, plan_numbers
 from jfrnn._engine.warp import call_kernels, check_platform, missing
 from jfrnn._tracing import on_platform
 from jfrnn.kernels import Kind, _clang, hashgrid
@@ -76,23 +76,21 @@ class HashGridEngine:
 @kernel
 def _hashgrid_callable(kind: Kind, radius: float, cuda: bool) -> Call:
     """Return what searches on a platform; it knows its radius, and bears it in its name."""
-    plan = functools.partial(_plan, kind, radius, cuda)
+
+    def plan(shapes: Shapes, _: int) -> Plan:
+        numbers = plan_numbers(kind, shapes) | hashgrid.split_width(radius)
+        numbers["drop_self"] &= kind.own
+        n, m = numbers["n"], numbers["m"]
+        grid = hashgrid.grid_shape(n, kind.dim)
+        numbers["cells_x"], numbers["cells_y"], _ = grid
+        kernels = hashgrid.search_kernels(kind, cuda)
+        rows = [] if cuda else huge_pages(kind, shapes)
+        pack, query = Launch(kernels.pack, n if cuda else 1), Launch(kernels.query, m if cuda else 1)
+        steps = [Clear("info", 8), pack, Launch(hashgrid.build_kernel(kind.double)), *rows, query]
+        return Plan(steps, numbers, absent(kind), functools.partial(_keep_grid, grid, kind.double, n))
+
     found = describe_call("hashgrid_cuda" if cuda else "hashgrid_cpu", kind, plan)
     return found._replace(name=f"{found.name}_{radius.hex()}")
-
-
-def _plan(kind: Kind, radius: float, cuda: bool, shapes: Shapes, _: int) -> Plan:
-    numbers = plan_numbers(kind, shapes) | hashgrid.split_width(radius)
-    numbers["drop_self"] &= kind.own
-    n, m = numbers["n"], numbers["m"]
-    grid = hashgrid.grid_shape(n, kind.dim)
-    numbers["cells_x"], numbers["cells_y"], _ = grid
-    kernels = hashgrid.search_kernels(kind, cuda)
-    rows = [] if cuda else huge_pages(kind, shapes)
-    pack, query = Launch(kernels.pack, n if cuda else 1), Launch(kernels.query, m if cuda else 1)
-    steps = [Clear("info", 8), pack, Launch(hashgrid.build_kernel(kind.double)), *rows, query]
-    keep = functools.partial(_keep_grid, grid, kind.double, n)
-    return Plan(steps, numbers, absent(kind), keep)
 
 
 def _keep_grid(shape: tuple[int, int, int], double: bool, points: int, device: int) -> Kept:
@@ -110,12 +108,8 @@ def _keep_grid(shape: tuple[int, int, int], double: bool, points: int, device: i
 @functools.cache
 def _hash_grid(shape: tuple[int, int, int], double: bool, device: int) -> HashGrid:
     """Keep one grid per device, shape and dtype: calls take turns."""
-    wp = load_warp()
-    made = wp.HashGrid(*shape, device=_name(device), dtype=wp.float64 if double else wp.float32)
+    wp, name = load_warp(), "cpu" if device < 0 else f"cuda:{device}"
+    made = wp.HashGrid(*shape, device=name, dtype=wp.float64 if double else wp.float32)
     if device >= 0:
-        wp.synchronize_device(_name(device))  # calls work on other streams than the one on which it was made
+        wp.synchronize_device(name)  # calls work on other streams than the one on which it was made
     return made
-
-
-def _name(device: int) -> str:
-    return "cpu" if device < 0 else f"cuda:{device}"

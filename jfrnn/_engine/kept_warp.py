@@ -11,10 +11,9 @@ import numpy as np
 from jax import Array
 
 from jfrnn._engine.launch import Call, Shapes, kernel
-from jfrnn._engine.operands import lattice_numbers, periodic_kind
+from jfrnn._engine.operands import lattice_numbers, periodic_kind, scalar_of
 from jfrnn._engine.plans import Clear, Launch, Plan, ask_for_huge_pages, share
 from jfrnn._engine.sum_results import FoundSums, Summed, SumsOf
-from jfrnn._engine.variants import scalar_of
 from jfrnn._geometry import EXCHANGED, LARGEST_TURN, Cutoff, Cutoffs, Lattice
 from jfrnn._tracing import on_platform
 from jfrnn.kernels import Kernel, Kind, kept

@@ -15,6 +15,7 @@ import hashlib
 import importlib
 import json
 import mmap
+import operator
 import os
 import platform
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -76,29 +77,21 @@ def kernel(make: Callable[..., Call]) -> Callable[..., Callable[..., Any]]:
 
 
 def _call(found: Call, recipe: str, *inputs: Array, output_dims: dict[str, Any]) -> Sequence[Array]:
-    shapes = [x.shape for x in inputs] + [_shape(output_dims[key]) for key in found.results]
-    kind = _varying(inputs)
-    results = [jax.ShapeDtypeStruct(_shape(output_dims[key]), dtype, **kind) for key, dtype in found.results.items()]
-    name = f"{found.name}@{_sources()}@{'_'.join('x'.join(map(str, shape)) for shape in shapes)}"
+    dims = [output_dims[key] for key in found.results]
+    written = [shape if isinstance(shape, tuple) else (shape,) for shape in dims]
+    kinds = [getattr(jax.typeof(x), "manual_axis_type", None) for x in inputs]
+    axes, more = frozenset().union(*(kind.varying for kind in kinds if kind is not None)), {}
+    if axes:  # inside `jax.shard_map`, results vary along the axes along which an input does
+        mesh, everywhere = jax.sharding.get_abstract_mesh(), jax.sharding.PartitionSpec()
+        kind = jax.sharding.ManualAxisType(varying=axes)  # pyright: ignore[reportAttributeAccessIssue]
+        more = {"manual_axis_type": kind, "sharding": jax.sharding.NamedSharding(mesh, everywhere)}
+    results = [jax.ShapeDtypeStruct(shape, dtype, **more) for shape, dtype in zip(written, found.results.values(), strict=True)]
+    shapes = "_".join("x".join(map(str, shape)) for shape in (*(x.shape for x in inputs), *written))
+    name = f"{found.name}@{_sources()}@{shapes}"
     names = list(found.inputs), list(found.results)
     aliases = {names[0].index(given): names[1].index(result) for result, given in found.instead.items()}
     call = jax.ffi.ffi_call(TARGET, results, vmap_method="sequential", input_output_aliases=aliases)
     return call(*inputs, kernel=name, recipe=recipe)
-
-
-def _shape(dims: int | tuple[int, ...]) -> tuple[int, ...]:
-    return dims if isinstance(dims, tuple) else (dims,)
-
-
-def _varying(inputs: Sequence[Array]) -> dict[str, Any]:
-    """Return what types of results say inside `jax.shard_map`: they vary along the axes along which an input does."""
-    kinds = [getattr(jax.typeof(x), "manual_axis_type", None) for x in inputs]
-    axes = frozenset().union(*(kind.varying for kind in kinds if kind is not None))
-    if not axes:
-        return {}
-    mesh, everywhere = jax.sharding.get_abstract_mesh(), jax.sharding.PartitionSpec()
-    kind = jax.sharding.ManualAxisType(varying=axes)  # pyright: ignore[reportAttributeAccessIssue]
-    return {"manual_axis_type": kind, "sharding": jax.sharding.NamedSharding(mesh, everywhere)}
 
 
 # --- what a program carries -------------------------------------------------------------------------------------------
@@ -132,7 +125,7 @@ def _sources() -> str:
 
 def _files(folder: Traversable) -> Iterator[Traversable]:
     """Yield the sources in a folder and below it; packages that are installed beneath the library are asked for by themselves."""
-    for path in sorted(folder.iterdir(), key=lambda path: path.name):
+    for path in sorted(folder.iterdir(), key=operator.attrgetter("name")):
         if path.is_dir() and path.name not in ("cases", "kernels"):
             yield from _files(path)
         elif path.name.endswith((".py", ".h", ".cuh")):
@@ -164,13 +157,6 @@ _MakePlan = ctypes.CFUNCTYPE(None, *_Text, *_Text, ctypes.c_int, ctypes.c_void_p
 _plans: dict[tuple[str, int], LaidPlan] = {}  # by name and device, those that were made last at the end
 
 
-def _make_plan(name: int, name_size: int, recipe: int, recipe_size: int, device: int, wrong: int) -> None:
-    def work() -> None:
-        _keep_plan(ctypes.string_at(name, name_size).decode(), ctypes.string_at(recipe, recipe_size).decode(), device)
-
-    _answer(work, wrong)
-
-
 _ON_FIRST = -2  # in place of a device's number: the first one that the process uses
 
 
@@ -189,10 +175,10 @@ def _keep_plan(name: str, recipe: str, device: int) -> None:
         desk.keep(laid)
 
 
-def _answer(work: Callable[[], None], wrong: int) -> None:
-    """Work, and write down what goes wrong, for native code to read."""
+def _make_plan(name: int, name_size: int, recipe: int, recipe_size: int, device: int, wrong: int) -> None:
+    """Keep a plan, and write down what goes wrong, for native code to read."""
     try:
-        work()
+        _keep_plan(ctypes.string_at(name, name_size).decode(), ctypes.string_at(recipe, recipe_size).decode(), device)
         message = b""
     except BaseException as error:
         message = _describe(error).encode(errors="replace")[: MOST_WORDS - 1].decode(errors="ignore").encode()
@@ -264,7 +250,7 @@ def _open() -> Desk:
 @functools.cache
 def _opened() -> Desk:
     header = (Path(jax.ffi.include_dir()) / "xla" / "ffi" / "api" / "c_api.h").read_text("utf-8")
-    desk = open_desk(compiler().load_launcher(header), _address(_behind_desk), _MOST)
+    desk = open_desk(compiler().load(compiler().launcher(header)), _address(_behind_desk), _MOST)
     for name, address in zip(_PLATFORMS, desk.handlers, strict=True):
         _doors[name].lead_to(address)
     atexit.register(desk.close)  # who asks while the interpreter exits would wait for it, and it for them; no result is waited for
@@ -283,10 +269,6 @@ def open_native() -> None:
     warn_of_folders()
 
 
-def _register() -> None:
-    for name, door in _doors.items():
-        capsule = jax.ffi.pycapsule(door.address)
-        jax.ffi.register_ffi_target(TARGET, {"instantiate": capsule, "execute": capsule}, platform=name)
-
-
-_register()
+for _name, _door in _doors.items():
+    _capsule = jax.ffi.pycapsule(_door.address)
+    jax.ffi.register_ffi_target(TARGET, {"instantiate": _capsule, "execute": _capsule}, platform=_name)

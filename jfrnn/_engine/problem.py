@@ -89,11 +89,6 @@ class Search(NamedTuple):
         return self.cutoff
 
     @property
-    def excluding(self) -> int:
-        """What queries exclude: 0 nothing, 1 sources, 2 images of sources."""
-        return 0 if self.exclude is None else 1 if self.exclude.codes is None else 2
-
-    @property
     def lattice(self) -> Lattice | None:
         """The lattice of a periodic space, or one per system."""
         return None if self.torus is None else self.torus[0]
@@ -207,6 +202,8 @@ def take_present(inputs: Inputs) -> Inputs:
 
     Queries have no mask; those that have none are moved to infinity.
     """
+    if inputs.batch is None:
+        return inputs
     there, asking = _have_system(inputs)
     if there is None:
         return inputs
@@ -244,9 +241,10 @@ def prepare_search(inputs: Inputs, options: Options) -> Search:
     sources, images = hide_inactive(given, active), options.images
     per_system = box is not None and box.per_system and batch is not None
     batch = None if batch is None or per_system else rank_systems(batch)
-    checks = _check_exclusions(exclude) | _check_systems(asked)
+    checks = {} if exclude is None or exclude.valid is None else {Status.EXCLUDED_OUT_OF_RANGE: exclude.valid}
+    checks |= {} if asked.batch is None else _check_systems(asked, asked.batch)
     if isinstance(cutoff, Radii):
-        asking = None if asked.queries is None else _have_system(asked)[1]
+        asking = None if asked.queries is None else rows_asked(asked)[1]
         sources, queries, checks[Status.INVALID_CUTOFF] = _with_valid_radii(sources, queries, active, asking, cutoff)
         cutoff = make_cutoffs(cutoff, options.closed, options.skin)
     if per_system:
@@ -264,18 +262,11 @@ def prepare_search(inputs: Inputs, options: Options) -> Search:
     return Search(sources, queries, cutoff, batch, (lattice, wrapped), checks, excluded)
 
 
-def _check_exclusions(exclude: Exclusions | None) -> dict[Status, Array]:
-    return {} if exclude is None or exclude.valid is None else {Status.EXCLUDED_OUT_OF_RANGE: exclude.valid}
-
-
-def _check_systems(asked: Inputs) -> dict[Status, Array]:
+def _check_systems(asked: Inputs, batch: Batch) -> dict[Status, Array]:
     """Check that all particles that take part have a number of a system, where each system has a box of one there is, or -1."""
-    batch, box = asked.batch, asked.box
-    if batch is None:
-        return {}
+    box = asked.box
     if box is not None and box.per_system:
-        boxes = len(box.vectors)
-        named = [(x >= -1) & (x < boxes) for x in (batch.sources, batch.queries) if x is not None]
+        named = [(x >= -1) & (x < len(box.vectors)) for x in (batch.sources, batch.queries) if x is not None]
     elif batch.fit is not None:
         named = [x for x in batch.fit if x is not None]
     else:

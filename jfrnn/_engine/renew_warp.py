@@ -14,10 +14,9 @@ from jax import Array
 
 from jfrnn._engine.auto import platform_of
 from jfrnn._engine.launch import Call, Shapes, kernel
-from jfrnn._engine.operands import MOST_IN_BOX, lattice_numbers
+from jfrnn._engine.operands import MOST_IN_BOX, describe_call, lattice_numbers
 from jfrnn._engine.plans import Launch, Plan
 from jfrnn._engine.problem import Inputs, Options
-from jfrnn._engine.variants import describe_call
 from jfrnn._engine.warp import PLATFORMS, all_meet, plan_few, plan_on_cuda
 from jfrnn._geometry import (
     FAR,

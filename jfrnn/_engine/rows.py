@@ -29,12 +29,6 @@ class Found(NamedTuple):
     turns: tuple[Array, Array | None] | None
 
 
-@functools.partial(compile_program, static_argnames=("options", "capacity"))
-def list_rows(inputs: Inputs, options: Options, capacity: int) -> Found:
-    """List the neighbors of every query: the compiled program of `search`."""
-    return _find(inputs, options, capacity)
-
-
 class FoundFlat(NamedTuple):
     """A flat list: where its rows begin, and the last one ends, [m + 1] int32, saturating; and what is found of it.
 
@@ -48,9 +42,9 @@ class FoundFlat(NamedTuple):
 @functools.partial(compile_program, static_argnames=("options", "total"))
 def list_flat(inputs: Inputs, options: Options, total: int) -> FoundFlat:
     """List the neighbors of every query in rows without gaps: count them, add up, and fill."""
-    counted = _find(inputs, options, None).rows
+    counted = find_rows(inputs, options, None).rows
     offsets = add_up(counted.counts)
-    found = _find(inputs, options, Room(jnp.minimum(offsets, total), total))
+    found = find_rows(inputs, options, Room(jnp.minimum(offsets, total), total))
     m, n = len(counted.counts), len(inputs.sources)
     there = lax.iota(jnp.int32, total) < offsets[-1]
     idx, receivers = (jnp.where(there, jnp.asarray(x), most) for x, most in ((found.rows.idx, n), (found.rows.receivers, m)))
@@ -72,7 +66,7 @@ def add_up(counts: Array) -> Array:
 @functools.partial(compile_program, static_argnames="options")
 def count_rows(inputs: Inputs, options: Options) -> tuple[Array, Array, Array]:
     """Count the neighbors of every query, [m] int32; return their maximum and the bits of `Status`, too: the program of `count`."""
-    rows = _find(inputs, options, None).rows
+    rows = find_rows(inputs, options, None).rows
     return rows.counts, rows.required, rows.status
 
 
@@ -82,19 +76,22 @@ def mark_counts(inputs: Inputs, counts: Array, status: Array) -> Array:
     return mark_rows(counts, good_rows(*rows_asked(inputs), are_whole(status)))
 
 
-def _find(inputs: Inputs, options: Options, capacity: int | Room | None) -> Found:
+def find_rows(inputs: Inputs, options: Options, capacity: int | Room | None) -> Found:
     """List the neighbors of every query, or only count them (capacity=None). Integers: no gradient flows through."""
-    present = take_present(inputs)
-    given, given_queries, active = lax.stop_gradient(present[:3])
+    given, given_queries, active = lax.stop_gradient(take_present(inputs)[:3])
     search = prepare_search(inputs, options)
     sources, queries, cutoff, _, torus, checks = search[:6]
     rows = _empty_rows(search, options, capacity) if 0 in search.sizes else options.engine.rows(search, options, capacity)
     if torus is not None and active is None and isinstance(cutoff, Cutoff):  # else positions may be infinite for other reasons
         checks = checks | {Status.NONFINITE: (torus[1].met & NOT_FINITE) == 0}
-    there = rows_asked(inputs)[1]
-    if given_queries is not None and there is not None:  # others are at infinity
-        given_queries = jnp.where(there[:, None], given_queries, 0)
-    rows = _with_status(rows, given, given_queries, active, checks)
+    if active is not None or checks:  # engines see inactive and out-of-range particles as non-finite ones
+        if Status.NONFINITE not in checks:
+            finite = (jnp.isfinite(given).all(axis=1) | (False if active is None else ~active)).all()
+            if given_queries is not None:
+                there = rows_asked(inputs)[1]  # others are at infinity
+                finite &= (jnp.isfinite(given_queries).all(axis=1) | (False if there is None else ~there)).all()
+            checks = checks | {Status.NONFINITE: finite}
+        rows = rows._replace(status=rows.status & ~Status.NONFINITE.value | bits_of(checks))
     images = options.images
     if rows.idx is None or torus is None or images is None or images.nearest:
         return Found(rows, None, None)
@@ -126,16 +123,6 @@ def fold_pairs(inputs: Inputs, options: Options, elements: int, visit: Visit[Sta
     return by_platform(on, (search._replace(checks={}), out))
 
 
-def _with_status(rows: Rows, sources: Array, queries: Array | None, active: Array | None, checks: dict[Status, Array]) -> Rows:
-    """Set the status bits that engines cannot know, as they see inactive and out-of-range particles as non-finite ones."""
-    if active is None and not checks:
-        return rows
-    if Status.NONFINITE not in checks:
-        finite = (jnp.isfinite(sources).all(axis=1) | (False if active is None else ~active)).all()
-        checks = checks | {Status.NONFINITE: finite & (True if queries is None else jnp.isfinite(queries).all())}
-    return rows._replace(status=rows.status & ~Status.NONFINITE.value | bits_of(checks))
-
-
 def _empty_rows(search: Search, options: Options, capacity: int | Room | None) -> Rows:
     """Return rows without neighbors, for searches without queries or sources."""
     n, m = search.sizes
@@ -145,3 +132,6 @@ def _empty_rows(search: Search, options: Options, capacity: int | Room | None) -
         return complete_rows(search, idx, jnp.zeros(m, jnp.int32), None)._replace(receivers=jnp.full(capacity.total, m, jnp.int32))
     idx = None if capacity is None else jnp.full((m, capacity), fill, jnp.int32)
     return complete_rows(search, idx, jnp.zeros(m, jnp.int32), capacity)
+
+
+list_rows = functools.partial(compile_program, static_argnames=("options", "capacity"))(find_rows)

@@ -128,8 +128,9 @@ def compiler() -> ModuleType:
 
 def warn_of_folders() -> None:
     """Warn of a folder in which programs cannot be kept."""
-    for note in compiler().take_notes():
-        warnings.warn(note, RuntimeWarning, stacklevel=level_of_caller())
+    notes = compiler().notes
+    while notes:
+        warnings.warn(notes.pop(0), RuntimeWarning, stacklevel=level_of_caller())
 
 
 def apart(work: Callable[[], Result]) -> Result:
@@ -138,19 +139,20 @@ def apart(work: Callable[[], Result]) -> Result:
     if holds or threading.current_thread() is not threading.main_thread():
         return work()
     try:
-        begun = _others().submit(work)
+        begun = _others.submit(work)
     except RuntimeError:  # while the interpreter exits
         return work()
     return begun.result()
 
 
-@functools.cache
-def _others() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(thread_name_prefix="jfrnn-start")
+def _begin_anew() -> None:
+    global _others
+    _others = ThreadPoolExecutor(thread_name_prefix="jfrnn-start")
 
 
+_begin_anew()
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_others.cache_clear)  # its threads stay behind
+    os.register_at_fork(after_in_child=_begin_anew)  # its threads stay behind
 
 
 def level_of_caller() -> int:

@@ -18,27 +18,25 @@ from jfrnn._engine.boxes_warp import box_neighbors
 from jfrnn._engine.launch import Call, Shapes, kernel, open_native
 from jfrnn._engine.operands import (
     MOST_IN_BOX,
-    cutoffs_of_particles,
-    excluded_rows,
-    orders_for_tree,
-    pack_particles,
-    periodic_kind,
-)
-from jfrnn._engine.plans import Clear, Launch, Plan, share
-from jfrnn._engine.problem import Engine, Features, Filter, Options, Room, Rows, Search, largest_radius
-from jfrnn._engine.start import check_warp
-from jfrnn._engine.variants import (
     absent,
+    cutoffs_of_particles,
     describe_call,
+    excluded_rows,
     huge_pages,
     kind_of_search,
     names_of_particles,
     names_of_tree,
+    orders_for_tree,
+    pack_particles,
+    periodic_kind,
     plan_numbers,
     row_dims,
     sort_on_cpu,
     split_rows,
 )
+from jfrnn._engine.plans import Clear, Launch, Plan, share
+from jfrnn._engine.problem import Engine, Features, Filter, Options, Room, Rows, Search, largest_radius
+from jfrnn._engine.start import check_warp
 from jfrnn._geometry import Cutoffs
 from jfrnn._tracing import on_platform
 from jfrnn.kernels import Kernel, Kind, _driver, cells_cpu, cells_cuda, few_cuda, tree_cpu, tree_cuda

@@ -8,11 +8,22 @@ from jax import Array
 
 from jfrnn._engine.boxes_warp import box_sums
 from jfrnn._engine.launch import Call, Shapes, kernel
-from jfrnn._engine.operands import cutoffs_of_particles, excluded_rows, orders_for_tree, pack_particles
+from jfrnn._engine.operands import (
+    SUMS,
+    cutoffs_of_particles,
+    describe_sums,
+    excluded_rows,
+    kind_of_search,
+    names_of_tree,
+    orders_for_tree,
+    pack_particles,
+    scalar_of,
+    size_numbers,
+    sort_on_cpu,
+)
 from jfrnn._engine.plans import Launch, Plan, share
 from jfrnn._engine.problem import Filter, Search
 from jfrnn._engine.sum_results import FoundSums, Summed, SumsOf, TermText, beside_rows, numbers_of_values
-from jfrnn._engine.variants import SUMS, describe_sums, kind_of_search, names_of_tree, scalar_of, size_numbers, sort_on_cpu
 from jfrnn._engine.warp import QUERIES_PER_THREAD, are_few, by_cells_or_tree, fit_tree, place_launches
 from jfrnn._geometry import Cutoffs
 from jfrnn._tracing import on_platform
@@ -37,15 +48,22 @@ def pair_sums(search: Search, keep: Filter, summed: Summed, values: tuple[Array,
     def on(cuda: bool, tree: bool = False) -> Callable[[Search, tuple[Array, Array, Array]], FoundSums]:
         def call(search: Search, values: tuple[Array, Array, Array]) -> FoundSums:
             of_particles = cutoffs_of_particles(search.cutoff) if isinstance(search.cutoff, Cutoffs) else {}
-            more = [*excluded_rows(search), *of_particles.values()]
+            particles, more = pack_particles(search), [*excluded_rows(search), *of_particles.values()]
+            n, m, width, double = len(particles[0]), len(particles[1]), 2 if kind.double else 1, kind.double
             if not cuda:
-                return _sum_on_cpu(kind, term, key, pack_particles(search), [*beside_rows(term, values), *more])
-            if not kind.rule and are_few(search):
-                return _sum_few(kind, term, key, [*pack_particles(search), *values, *more])
-            orders = [*of_particles.values(), *orders_for_tree(search).values()] if tree else []
-            particles = pack_particles(search)
-            words = sort_particles(kind._replace(tree=tree), particles, orders)
-            return _sum_on_cuda(kind._replace(tree=tree), term, key, particles, [*values, *words, *more])
+                results = SumsOf(term, kind, m, pair_sum_cpu.slots(m))
+                words = (tree_cpu if kind.rule else cells_cpu).scratch_words(n, m, kind.dim, width, kind.own)
+                dims = {"columns": max(pair_sum_cpu.sorted_numbers(term, n, kind.dim, double), 1), "info": 2, "scratch": words}
+                make, given = _cpu_callable(kind, term, key), [*beside_rows(term, values), *more]
+            elif not kind.rule and are_few(search):
+                results, dims = SumsOf(term, kind, m, few_cuda.slots(m)), {}
+                make, given = _few_callable(kind, term, key), [*values, *more]
+            else:
+                orders = [*of_particles.values(), *orders_for_tree(search).values()] if tree else []
+                results, one = SumsOf(term, kind, m, pair_sum_cuda.slots(m)), kind._replace(tree=tree)
+                dims = {"values": max(pair_sum_cuda.sorted_numbers(term, n, kind.dim, double), 1)}
+                make, given = _cuda_callable(one, term, key), [*values, *sort_particles(one, particles, orders), *more]
+            return results.unpack(*make(*particles, *given, output_dims=results.dims() | dims)[: len(SUMS)])
 
         return call
 
@@ -53,26 +71,7 @@ def pair_sums(search: Search, keep: Filter, summed: Summed, values: tuple[Array,
     return on_platform(search._replace(checks={}), values, late=bool(kind.rule), cpu=on(False), cuda=cuda)
 
 
-Particles = tuple[Array, Array, Array]  # rows of sources and of queries, and the shared numbers
-
-
-def _sum_on_cpu(kind: Kind, term: TermText, key: str, particles: Particles, given: list[Array]) -> FoundSums:
-    """Let XLA call the kernels that sort and sum; `given` are values, rows of exclusions, and cutoffs that differ."""
-    n, m = len(particles[0]), len(particles[1])
-    results = SumsOf(term, kind, m, pair_sum_cpu.slots(m))
-    words = (tree_cpu if kind.rule else cells_cpu).scratch_words(n, m, kind.dim, 2 if kind.double else 1, kind.own)
-    dims = results.dims() | {"columns": max(pair_sum_cpu.sorted_numbers(term, n, kind.dim, kind.double), 1)}
-    found = _cpu_callable(kind, term, key)(*particles, *given, output_dims=dims | {"info": 2, "scratch": words})
-    return results.unpack(*found[: len(SUMS)])
-
-
-def _sum_few(kind: Kind, term: TermText, key: str, given: list[Array]) -> FoundSums:
-    m = len(given[1])
-    results = SumsOf(term, kind, m, few_cuda.slots(m))
-    return results.unpack(*_few_callable(kind, term, key)(*given, output_dims=results.dims()))
-
-
-def sort_particles(kind: Kind, particles: Particles, orders: list[Array]) -> Sequence[Array]:
+def sort_particles(kind: Kind, particles: tuple[Array, Array, Array], orders: list[Array]) -> Sequence[Array]:
     """Sort particles on CUDA by a call of its own, which XLA makes once for a sum and its derivative; return what it wrote.
 
     `orders` are what a tree is fitted to.
@@ -83,68 +82,55 @@ def sort_particles(kind: Kind, particles: Particles, orders: list[Array]) -> Seq
     return _sorting_callable(kind)(*particles, *orders, output_dims={"info": 2, "scratch": words})
 
 
-def _sum_on_cuda(kind: Kind, term: TermText, key: str, particles: Particles, given: list[Array]) -> FoundSums:
-    """Let XLA call the kernels that sum over sorted particles."""
-    n, m = len(particles[0]), len(particles[1])
-    results = SumsOf(term, kind, m, pair_sum_cuda.slots(m))
-    dims = results.dims() | {"values": max(pair_sum_cuda.sorted_numbers(term, n, kind.dim, kind.double), 1)}
-    return results.unpack(*_cuda_callable(kind, term, key)(*particles, *given, output_dims=dims)[: len(SUMS)])
-
-
 @kernel
 def _cpu_callable(kind: Kind, term: TermText, key: str) -> Call:
-    plan = functools.partial(_plan_on_cpu, kind, term, key)
+    def plan(shapes: Shapes, _: int) -> Plan:
+        numbers = _numbers(kind, term, shapes) | numbers_of_values(term, shapes)
+        values = [share(pair_sum_cpu.sort_kernel(kind.dim, kind.double), numbers["n"])] if term.source_columns else []
+        query = share(pair_sum_cpu.query_kernel(kind, term, key), numbers["m"], QUERIES_PER_THREAD)
+        return Plan([*sort_on_cpu(kind, numbers["n"]), *values, query], numbers)
+
     return describe_sums("pair_sum_cpu", kind, key, plan, _GIVEN, more={"columns": scalar_of(kind), **_WORDS})
 
 
 @kernel
 def _cuda_callable(kind: Kind, term: TermText, key: str) -> Call:
-    plan = functools.partial(_plan_on_cuda, kind, term, key)
+    def plan(shapes: Shapes, multiprocessors: int) -> Plan:
+        numbers = _numbers(kind, term, shapes)
+        launches = pair_sum_cuda.sum_kernels(kind, term, key).launches(numbers["n"], numbers["m"], multiprocessors)
+        return Plan([Launch(x.kernel, x.threads, beside=x.beside) for x in launches], numbers)
+
     return describe_sums("pair_sum_cuda", kind, key, plan, (*_GIVEN, *_WORDS), more={"values": scalar_of(kind)})
 
 
 @kernel
 def _few_callable(kind: Kind, term: TermText, key: str) -> Call:
-    return describe_sums("pair_sum_few_cuda", kind, key, functools.partial(_plan_few, kind, term, key), _GIVEN)
+    def plan(shapes: Shapes, _: int) -> Plan:
+        numbers = _numbers(kind, term, shapes)
+        query = few_cuda.sum_kernel(kind, few_cuda.warps(numbers["m"]), term, key)
+        numbers["drop_self"] &= kind.own
+        return Plan([Launch(query, few_cuda.threads(numbers["m"]))], numbers)
 
-
-def _plan_few(kind: Kind, term: TermText, key: str, shapes: Shapes, _: int) -> Plan:
-    numbers = _numbers(kind, term, shapes)
-    query = few_cuda.sum_kernel(kind, few_cuda.warps(numbers["m"]), term, key)
-    numbers["drop_self"] &= kind.own
-    return Plan([Launch(query, few_cuda.threads(numbers["m"]))], numbers)
+    return describe_sums("pair_sum_few_cuda", kind, key, plan, _GIVEN)
 
 
 @kernel
 def _sorting_callable(kind: Kind) -> Call:
     """Make a function that XLA calls to sort particles on CUDA."""
+
+    def plan(shapes: Shapes, multiprocessors: int) -> Plan:
+        numbers = size_numbers(shapes, kind.own)
+        if kind.tree:
+            return Plan(fit_tree(tree_cuda.fit_kernel(kind), numbers), numbers)
+        # what sorts particles takes the arguments of a search that only counts
+        more = dict.fromkeys(("capacity", "closed", "drop_self"), 0)
+        stages = cells_cuda.cell_kernels(kind).stages(numbers["n"], numbers["m"], kind.own, multiprocessors)
+        return Plan(place_launches(stages), numbers | more, ["idx", "count", "starts", "receivers"])
+
     given = (*_GIVEN[:3], *names_of_tree(kind.rule) * kind.tree)
-    return Call(f"jfrnn_sorting_cuda_{kind.name}", given, _WORDS, functools.partial(_plan_sorting, kind))
-
-
-def _plan_sorting(kind: Kind, shapes: Shapes, multiprocessors: int) -> Plan:
-    numbers = size_numbers(shapes, kind.own)
-    if kind.tree:
-        return Plan(fit_tree(tree_cuda.fit_kernel(kind), numbers), numbers)
-    # what sorts particles takes the arguments of a search that only counts
-    more = dict.fromkeys(("capacity", "closed", "drop_self"), 0)
-    stages = cells_cuda.cell_kernels(kind).stages(numbers["n"], numbers["m"], kind.own, multiprocessors)
-    return Plan(place_launches(stages), numbers | more, ["idx", "count", "starts", "receivers"])
+    return Call(f"jfrnn_sorting_cuda_{kind.name}", given, _WORDS, plan)
 
 
 def _numbers(kind: Kind, term: TermText, shapes: Shapes) -> dict[str, int]:
     flags = {"closed": kind.closed, "drop_self": kind.drop_self, "width": term.source_columns}
     return size_numbers(shapes, kind.own) | flags
-
-
-def _plan_on_cpu(kind: Kind, term: TermText, key: str, shapes: Shapes, _: int) -> Plan:
-    numbers = _numbers(kind, term, shapes) | numbers_of_values(term, shapes)
-    values = [share(pair_sum_cpu.sort_kernel(kind.dim, kind.double), numbers["n"])] if term.source_columns else []
-    query = share(pair_sum_cpu.query_kernel(kind, term, key), numbers["m"], QUERIES_PER_THREAD)
-    return Plan([*sort_on_cpu(kind, numbers["n"]), *values, query], numbers)
-
-
-def _plan_on_cuda(kind: Kind, term: TermText, key: str, shapes: Shapes, multiprocessors: int) -> Plan:
-    numbers = _numbers(kind, term, shapes)
-    launches = pair_sum_cuda.sum_kernels(kind, term, key).launches(numbers["n"], numbers["m"], multiprocessors)
-    return Plan([Launch(x.kernel, x.threads, beside=x.beside) for x in launches], numbers)

@@ -2,7 +2,6 @@
 
 import dataclasses
 import math
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -10,17 +9,37 @@ import numpy as np
 from jax import Array
 
 from jfrnn._engine import Inputs, Options, count_few, count_rows
-from jfrnn._geometry import Box, NeighborOverflowError, Status, names_of_bits, shape_of, tell
+from jfrnn._geometry import Box, Status, names_of_bits, shape_of, tell
 from jfrnn._search.edges import Edges, Graph, close_edges, edges_of, edges_of_rows, make_graph, no_edges
 from jfrnn._search.exports import MOST_PAIRS
 from jfrnn._search.kept_search import KeptSearch
-from jfrnn._search.making import find_flat_fields
-from jfrnn._search.present import Present
-from jfrnn._search.reverse import Reverse
-from jfrnn._search.topology import Topology
+from jfrnn._search.present import Present, Reverse, Topology
 from jfrnn._tracing import Points, Real, at_once, own_transfers
 
 _TOTAL_STEP = 16  # steps between powers of two, in which totals are rounded up
+
+
+def round_total(pairs: int) -> int:
+    """Round a total up, by 6 % at most, so that similar scenes share one compiled program."""
+    step = max(1 << max(pairs - 1, 1).bit_length() - 1, _TOTAL_STEP) // _TOTAL_STEP
+    return min(-(-max(pairs, 1) // step) * step, MOST_PAIRS)
+
+
+def count_total(inputs: Inputs, options: Options, slack: Real) -> int:
+    """Count the pairs at concrete positions; return a total of `slack` times as many.
+
+    Raises:
+        ValueError: they are more than int32 can number.
+    """
+    with at_once(), own_transfers():
+        known = count_few(inputs, options)
+        pairs = int(np.sum(np.asarray(count_rows(inputs, options=options)[0]) if known is None else known, dtype=np.int64))
+    if pairs > MOST_PAIRS:
+        raise ValueError(
+            f"total must be at most {MOST_PAIRS}, as many pairs as int32 can number, and there are {pairs}: search in parts, with "
+            "queries=, or sum with pair_sum, which stores no pairs."
+        )
+    return round_total(math.ceil(pairs * slack))
 
 
 @jax.tree_util.register_dataclass
@@ -52,6 +71,8 @@ class EdgeList(KeptSearch):
     offsets: Array
     _full = Status.TOTAL_OVERFLOW
     _harmless = Status.NONFINITE
+    _room_name = "total"
+    _round_room, _count_room = staticmethod(round_total), staticmethod(count_total)
 
     def __repr__(self) -> str:
         """Summarize the list in a line; waits for the device."""
@@ -138,15 +159,6 @@ class EdgeList(KeptSearch):
     def _row_count(self) -> int:
         return self.offsets.shape[-1] - 1
 
-    def _room_for(self, needed: int) -> int:
-        return round_total(needed)
-
-    def _count_room(self, inputs: Inputs, options: Options, slack: Real) -> int:
-        return count_total(inputs, options, slack)
-
-    def _find(self, inputs: Inputs, room: int) -> dict[str, Any]:
-        return find_flat_fields(inputs, self.problem.options, room, self.skin > 0, self.reverse is not None)
-
     def _close_edges(self, sources: Array, rows: Array, box: Box | None) -> tuple[Array, Array | None]:
         """Say which edges are pairs at these positions, and return their shifts, as `close_edges` does."""
         self._check_single()
@@ -172,32 +184,3 @@ class EdgeList(KeptSearch):
     def _check_single(self) -> None:
         if self.senders.ndim != 1:
             raise ValueError(f"take one list at a time, got senders of shape {list(self.senders.shape)}: index the batch first.")
-
-    def _check_known(self, spared: Status = Status.OK) -> None:
-        status = self._bits(spared)
-        if Status.TOTAL_OVERFLOW in status:
-            raise NeighborOverflowError(int(np.max(jax.device_get(self.required))), self.total, "total")
-        self._refuse(status)
-
-
-def round_total(pairs: int) -> int:
-    """Round a total up, by 6 % at most, so that similar scenes share one compiled program."""
-    step = max(1 << max(pairs - 1, 1).bit_length() - 1, _TOTAL_STEP) // _TOTAL_STEP
-    return min(-(-max(pairs, 1) // step) * step, MOST_PAIRS)
-
-
-def count_total(inputs: Inputs, options: Options, slack: Real) -> int:
-    """Count the pairs at concrete positions; return a total of `slack` times as many.
-
-    Raises:
-        ValueError: they are more than int32 can number.
-    """
-    with at_once(), own_transfers():
-        known = count_few(inputs, options)
-        pairs = int(np.sum(np.asarray(count_rows(inputs, options)[0]) if known is None else known, dtype=np.int64))
-    if pairs > MOST_PAIRS:
-        raise ValueError(
-            f"total must be at most {MOST_PAIRS}, as many pairs as int32 can number, and there are {pairs}: search in parts, with "
-            "queries=, or sum with pair_sum, which stores no pairs."
-        )
-    return round_total(math.ceil(pairs * slack))

@@ -24,9 +24,7 @@ from jfrnn._geometry import (
 )
 from jfrnn._search.exports import flat_pairs, row_offsets
 from jfrnn._search.geometry import edge_shifts, ends_of, lattice_of_rows, norms
-from jfrnn._search.present import Present
-from jfrnn._search.reverse import Reverse
-from jfrnn._search.topology import Topology
+from jfrnn._search.present import Present, Reverse, Topology
 from jfrnn._search.triplets import Triplets, triplets_of
 from jfrnn._tracing import call_apart, compile_program, on_platform
 

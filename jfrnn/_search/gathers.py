@@ -17,8 +17,7 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
 from jfrnn._engine import collect_slots
-from jfrnn._search.reverse import MOST_SLOTS
-from jfrnn._search.topology import Topology
+from jfrnn._search.present import MOST_SLOTS, Topology
 from jfrnn._tracing import (
     Aval,
     Internal,

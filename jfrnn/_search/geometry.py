@@ -23,13 +23,23 @@ from jfrnn._geometry import (
     is_pair_of,
     make_lattice,
     nearest_shifts,
+    rounded_product,
+    rounded_scaled,
     shift_pairs,
     turns_between,
     unpack_turns,
 )
-from jfrnn._search.present import ImagesMade, Present
-from jfrnn._search.topology import Topology
-from jfrnn._tracing import call_apart, compile_program
+from jfrnn._search.present import ImagesMade, Present, Topology
+from jfrnn._tracing import call_apart, compile_program, own_transfers
+
+
+def _of_rows(vectors: Array, systems: Array, native: bool) -> Array:
+    """Return the vectors of the box of each row; rows without a box get any. Differentiable by gathers."""
+    from jfrnn._search.gathers import gather
+
+    boxes, nearest = len(vectors), jnp.clip(systems, 0, len(vectors) - 1)
+    topology = Topology(nearest[:, None], None, None, None, boxes, 1, False, native)
+    return gather(vectors.reshape(boxes, -1), topology).reshape(-1, *vectors.shape[1:])
 
 
 def lattice_of_rows(box: Box, kind: Images, dtype: np.dtype, systems: Array | None, native: bool) -> Lattice:
@@ -37,15 +47,36 @@ def lattice_of_rows(box: Box, kind: Images, dtype: np.dtype, systems: Array | No
 
     `systems` [rows] are those of the rows, of which some may have no box: these get any.
     """
-    from jfrnn._search.gathers import gather
-
     lattice = make_lattice(box, kind, dtype)
     if not kind.per_system or systems is None:
         return lattice
-    boxes, nearest = len(lattice.origin), jnp.clip(systems, 0, len(lattice.origin) - 1)
-    topology = Topology(nearest[:, None], None, None, None, boxes, 1, False, native)
-    matrix = gather(lattice.matrix.reshape(boxes, -1), topology).reshape(-1, lattice.dim, lattice.dim)
-    return dataclasses.replace(lax.stop_gradient(lattice).of_rows(nearest), matrix=matrix)
+    fixed = lax.stop_gradient(lattice).of_rows(jnp.clip(systems, 0, len(lattice.origin) - 1))
+    return dataclasses.replace(fixed, matrix=_of_rows(lattice.matrix, systems, native))
+
+
+def real_points(sources: Array, queries: Array | None, box: Box, batch: Batch | None, native: bool) -> tuple[Array, Array | None]:
+    """Return sources and queries as lengths, of coordinates that count the vectors of a box: coordinates @ vectors.
+
+    Each component is computed in twice the precision and rounded once, the same on every device; all that follows, such as the
+    exact decision about pairs, is about these numbers. Differentiable in coordinates and vectors, by gathers. `native`: Warp's
+    kernels run where the points are.
+    """
+    with own_transfers():
+        return _multiply(sources, queries, box.vectors, batch, box.orthogonal, box.per_system, native)
+
+
+@functools.partial(compile_program, static_argnames=("orthogonal", "per_system", "native"))
+def _multiply(
+    sources: Array, queries: Array | None, vectors: Array, batch: Batch | None, orthogonal: bool, per_system: bool, native: bool
+) -> tuple[Array, Array | None]:
+    vectors = jnp.asarray(vectors).astype(sources.dtype)
+
+    def real(points: Array, systems: Array | None) -> Array:
+        rows = _of_rows(vectors, systems, native) if per_system and systems is not None else vectors
+        return rounded_scaled(points, rows) if orthogonal else rounded_product(points, rows)
+
+    of_sources, of_queries = (None, None) if batch is None else (batch.sources, batch.of_queries)
+    return real(sources, of_sources), None if queries is None else real(queries, of_queries)
 
 
 class Ends(NamedTuple):

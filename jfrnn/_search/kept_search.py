@@ -2,9 +2,9 @@
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from types import FunctionType
-from typing import Any, Self, TypeVar
+from typing import ClassVar, Self, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -19,6 +19,7 @@ from jfrnn._geometry import (
     Box,
     Exclusions,
     Images,
+    NeighborOverflowError,
     Radii,
     Status,
     are_whole,
@@ -38,12 +39,10 @@ from jfrnn._geometry import (
     round_box,
 )
 from jfrnn._search.culprits import name_culprits
-from jfrnn._search.fractional import real_points
-from jfrnn._search.kept_options import KeptOptions
-from jfrnn._search.present import ImageCodes, Present
-from jfrnn._search.problem import Problem
-from jfrnn._search.reverse import Reverse
-from jfrnn._search.topology import Topology
+from jfrnn._search.geometry import real_points
+from jfrnn._search.making import find_fields
+from jfrnn._search.present import ImageCodes, Present, Reverse, Topology
+from jfrnn._search.problem import KeptOptions, Problem
 from jfrnn._search.verlet import Verlet, has_moved_too_far
 from jfrnn._tracing import Flags, Given, Numbers, Points, Real, call_apart, compile_program, on_platform, own_transfers
 
@@ -66,6 +65,9 @@ class KeptSearch(KeptOptions):
     problem: Problem = dataclasses.field(metadata={"static": True})
     _full = Status.ROW_OVERFLOW  # the bit that says that there is too little room
     _harmless = ROWS_ARE_WHOLE  # bits that do not mean missing pairs
+    _room_name = "capacity"
+    _round_room: ClassVar[Callable[[int], int]]  # rounds the room that is needed up, so that similar scenes share a program
+    _count_room: ClassVar[Callable[[Inputs, Options, float], int]]  # the room that a search at concrete positions takes, with slack
 
     def __init_subclass__(cls, **options: object) -> None:
         """Give a class its inherited methods under its own name, which errors of Python tell: users know no other."""
@@ -96,30 +98,27 @@ class KeptSearch(KeptOptions):
         """Let kernels decide whether the list is made anew, and make it."""
         raise NotImplementedError
 
-    def _find(self, inputs: Inputs, room: int) -> dict[str, Any]:
-        """Search, and return the fields that come from data."""
-        raise NotImplementedError
-
-    def _room_for(self, needed: int) -> int:
-        """Round the room that is needed up, so that similar scenes share a program."""
-        raise NotImplementedError
-
-    def _count_room(self, inputs: Inputs, options: Options, slack: Real) -> int:
-        """Return the room that a search at concrete positions takes, `slack` times."""
+    def _pairs_held(self) -> int:
+        """Return how many pairs a padded list holds."""
         raise NotImplementedError
 
     def _check_known(self, spared: Status = Status.OK) -> None:
-        """Raise what status bits report, except the spared ones; a traced list is not checked."""
-        raise NotImplementedError
+        """Raise what status bits report, except the spared ones; a traced list is not checked.
 
-    def _refuse(self, status: Status) -> None:
-        """Raise what these bits report, if any is set; a list with a skin names particles, where it was rebuilt."""
-        if status:
-            verlet, problem, more = self.verlet, self.problem, ""
-            if verlet is not None and verlet.positions.ndim == 2:
-                kept = (verlet.positions, verlet.queries, None, verlet.box, verlet.radii or self.radii, self.batch, self.exclude)
-                more = name_culprits(status & ~(Status.NONFINITE if self.masked else Status.OK), problem.inputs(*kept))
-            refuse_status(status, self.box, self.box_kind, problem.reach(self.radii), more)
+        A list with a skin names particles, where it was rebuilt.
+        """
+        status = (known_status(self.status) or Status.OK) & ~spared
+        if not status:
+            return
+        if self._full in status:
+            raise NeighborOverflowError(int(np.max(jax.device_get(self.required))), self._room, self._room_name)
+        if Status.TOTAL_OVERFLOW in status:
+            raise ValueError(f"{status.message} At present it holds {self._pairs_held()}.")
+        verlet, problem, more = self.verlet, self.problem, ""
+        if verlet is not None and verlet.positions.ndim == 2:
+            kept = (verlet.positions, verlet.queries, None, verlet.box, verlet.radii or self.radii, self.batch, self.exclude)
+            more = name_culprits(status & ~(Status.NONFINITE if self.masked else Status.OK), problem.inputs(*kept))
+        refuse_status(status, self.box, self.box_kind, problem.reach(self.radii), more)
 
     def _mark(self, x: Array) -> Array:
         """Return what was computed of the pairs; where the list is traced, NaN or the smallest integer if pairs may be missing.
@@ -243,12 +242,13 @@ class KeptSearch(KeptOptions):
         if any(isinstance(x, Tracer) for x in jax.tree.leaves((sources, rows, active, box, radii, self.required))):
             raise TypeError("grow() changes the shape of the list and cannot run inside jax.jit: call it on what jit returns.")
         images = self._grow_images(box, radii)
-        wider = _replace(self, problem=self.problem.with_images(images))
+        options = self.problem.options._replace(images=images)
+        wider = _replace(self, problem=dataclasses.replace(self.problem, options=options))
         if box is not None and images is not None:
             box = box_of_list(box, images, self.problem.reach(radii))
-        inputs, options = self.problem.inputs(sources, rows, active, box, radii, self.batch, self.exclude), wider.problem.options
+        inputs = self.problem.inputs(sources, rows, active, box, radii, self.batch, self.exclude)
         with own_transfers():
-            met = self._room_for(math.ceil(slack * int(np.max(np.asarray(self.required)))))
+            met = self._round_room(math.ceil(slack * int(np.max(np.asarray(self.required)))))
             made = _remake(wider, inputs, max(self._room, met, self._count_room(inputs, options, slack)))
         made.check()
         return made
@@ -304,27 +304,19 @@ class KeptSearch(KeptOptions):
 
     def _geometry_inputs(self, positions: Points, queries: Points | None, box: Box | None) -> tuple[Array, Array, Box | None]:
         """Return the present positions of sources and rows, as lengths, and the present box, after checking that they fit."""
-        sources, rows = self._check_points(positions, queries)
-        box = self._box_now(box, sources)
-        asking = rows if self.own_queries else None
-        real, asking = real_points(sources, asking, box, self.batch, self.problem.options.engine.native)
-        return real, real if asking is None else asking, box
-
-    def _check_points(self, positions: Points, queries: Points | None) -> tuple[Array, Array]:
-        sources = check_again("positions", positions, self.dtype, self.dim, self.source_count)
+        problem, rows = self.problem, None
+        sources = check_again("positions", positions, problem.dtype, problem.dim, problem.source_count)
         check_devices("positions", sources, self.status)
-        if self.own_queries != (queries is not None):
-            state = "with queries: pass queries=" if self.own_queries else "without queries: leave queries out"
+        if problem.own_queries != (queries is not None):
+            state = "with queries: pass queries=" if problem.own_queries else "without queries: leave queries out"
             raise ValueError(f"this list was made {state}.")
-        if queries is None:
-            return sources, sources
-        rows = check_again("queries", queries, self.dtype, self.dim, self._row_count)
-        check_devices("queries", rows, self.status)
-        return sources, rows
-
-    def _bits(self, spared: Status) -> Status:
-        """Return the bits that are set, without the spared ones; none while traced."""
-        return (known_status(self.status) or Status.OK) & ~spared
+        if queries is not None:
+            rows = check_again("queries", queries, problem.dtype, problem.dim, self._row_count)
+            check_devices("queries", rows, self.status)
+        box = self._box_now(box, sources)
+        if box is not None and box.fractional:
+            sources, rows = real_points(sources, rows, box, self.batch, problem.options.engine.native)
+        return sources, sources if rows is None else rows, box
 
 
 def _replace(nbrs: Kept, **fields: object) -> Kept:
@@ -373,4 +365,5 @@ def _make_again_if_stale(nbrs: Kept, inputs: Inputs) -> Kept:
 
 def _remake(nbrs: Kept, inputs: Inputs, room: int) -> Kept:
     """Make a new list with the options of this one."""
-    return _replace(nbrs, **nbrs._find(inputs, room))
+    given = {"room": room, "moving": nbrs.skin > 0, "reversing": nbrs.reverse is not None, "flat": nbrs._room_name == "total"}
+    return _replace(nbrs, **find_fields(inputs, options=nbrs.problem.options, **given))

@@ -18,8 +18,7 @@ from jfrnn._engine import KeptList, kept_distances, kept_slopes
 from jfrnn._geometry import Box, bring_near, translation
 from jfrnn._search.gathers import bind, collect, define, gather
 from jfrnn._search.geometry import kept_list, kept_shifts, norms, vectors_of
-from jfrnn._search.present import Present
-from jfrnn._search.topology import Topology
+from jfrnn._search.present import Present, Topology
 from jfrnn._tracing import call_apart, compile_program
 
 

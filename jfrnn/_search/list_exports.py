@@ -8,7 +8,7 @@ import numpy as np
 from jax import Array
 from jax.core import Tracer
 
-from jfrnn._geometry import Box, NeighborOverflowError, Status
+from jfrnn._geometry import Box
 from jfrnn._search.edges import flat_pairs_of
 from jfrnn._search.exports import DenseNeighbors, check_held, check_total, flat_pairs, pair_total
 from jfrnn._search.kept_search import KeptSearch
@@ -124,18 +124,14 @@ class ListExports(KeptSearch):
         self._check_single()
         if near is None:
             self._check_known()
-            self._check_total(total)
+            if not isinstance(self.count, Tracer):
+                with at_once():
+                    check_held(pair_total(self.count, self.capacity), total)
             return flat_pairs(self.idx, self.count, self.source_count, total)
         with own_transfers():
             *made, held = flat_pairs_of(self.idx, near, self.source_count, total, self.problem.options.engine.native)
         check_held(held, total)
         return made[0], made[1], made[2]
-
-    def _check_total(self, total: int) -> None:
-        """Raise if the list holds more pairs, as far as that is known."""
-        if not isinstance(self.count, Tracer):
-            with at_once():
-                check_held(pair_total(self.count, self.capacity), total)
 
     def _count_pairs(self, name: str) -> int:
         """Return how many pairs the list holds, those of the skin included.
@@ -180,11 +176,5 @@ class ListExports(KeptSearch):
         if self.idx.ndim != 2:
             raise ValueError(f"exports take one list at a time, got idx of shape {list(self.idx.shape)}: index the batch first.")
 
-    def _check_known(self, spared: Status = Status.OK) -> None:
-        status = self._bits(spared)
-        if Status.ROW_OVERFLOW in status:
-            raise NeighborOverflowError(int(np.max(jax.device_get(self.required))), self.capacity)
-        if Status.TOTAL_OVERFLOW in status:
-            now = int(np.sum(jax.device_get(self.count), dtype=np.int64))
-            raise ValueError(f"{status.message} At present it holds {now}.")
-        self._refuse(status)
+    def _pairs_held(self) -> int:
+        return int(np.sum(jax.device_get(self.count), dtype=np.int64))

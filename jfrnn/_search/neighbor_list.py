@@ -4,13 +4,12 @@ The methods of a public class stand here with whole docstrings; those that expor
 """
 
 import dataclasses
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
-from jfrnn._engine import Inputs, KeptRows, Options, can_renew, renew_list
+from jfrnn._engine import Inputs, KeptRows, can_renew, renew_list
 from jfrnn._geometry import (
     Box,
     Status,
@@ -23,11 +22,9 @@ from jfrnn._search.edges import Edges, Graph, flat_edges, make_graph, no_edges
 from jfrnn._search.exports import check_held, check_total, pair_total
 from jfrnn._search.geometry import lattice_shifts, norms, vectors_of
 from jfrnn._search.list_exports import ListExports
-from jfrnn._search.making import count_capacity, find_fields, round_capacity
-from jfrnn._search.present import Present
-from jfrnn._search.reverse import MOST_SLOTS
-from jfrnn._search.topology import Topology, make_topology
-from jfrnn._tracing import Points, Real, Size, own_transfers
+from jfrnn._search.making import count_capacity, round_capacity
+from jfrnn._search.present import MOST_SLOTS, Present, Topology, make_topology
+from jfrnn._tracing import Points, Size, own_transfers
 
 _FEW_SLOTS = 1 << 18  # up to which a program takes longer to compile than its displacements to compute
 
@@ -59,6 +56,7 @@ class NeighborList(ListExports):
     """
 
     order: Array | None
+    _round_room, _count_room = staticmethod(round_capacity), staticmethod(count_capacity)
 
     def __repr__(self) -> str:
         """Summarize the list in a line; waits for the device."""
@@ -163,7 +161,8 @@ class NeighborList(ListExports):
         Differentiable: to any order; the gradient of a distance of 0 is 0. Jit: yes. vmap: yes.
         """
         topology = self._topology()
-        if 0 in self.idx.shape or not topology.measured or (self.box_kind is not None and self.box_kind.per_system):
+        kind, measured = self.problem.options.images, topology.native and topology.mutual and self.idx.size <= MOST_SLOTS
+        if 0 in self.idx.shape or not measured or (kind is not None and kind.per_system):
             vectors, mask = self.vectors(positions, queries=queries, box=box)
             return norms(vectors), mask
         sources, _, box = self._geometry_inputs(positions, queries, box)
@@ -251,15 +250,6 @@ class NeighborList(ListExports):
     @property
     def _row_count(self) -> int:
         return self.idx.shape[0]
-
-    def _room_for(self, needed: int) -> int:
-        return round_capacity(needed)
-
-    def _count_room(self, inputs: Inputs, options: Options, slack: Real) -> int:
-        return count_capacity(inputs, options, float(slack))
-
-    def _find(self, inputs: Inputs, room: int) -> dict[str, Any]:
-        return find_fields(inputs, self.problem.options, room, self.skin > 0, self.reverse is not None)
 
     def _may_renew(self, inputs: Inputs) -> bool:
         plain = self.reverse is None and self.images is None

@@ -1,6 +1,8 @@
 """The problem: the arguments that all public functions share, checked, and the static part that a list keeps."""
 
 import dataclasses
+import math
+from fractions import Fraction
 from typing import NamedTuple
 
 import jax
@@ -35,9 +37,19 @@ from jfrnn._geometry import (
     round_box,
 )
 from jfrnn._search.culprits import name_culprits
-from jfrnn._search.fractional import real_points
-from jfrnn._search.verlet import list_radius
+from jfrnn._search.geometry import real_points
 from jfrnn._tracing import Given
+
+
+def list_radius(cutoff: float, skin: float, dtype: np.dtype) -> float:
+    """Return cutoff + skin, both of this dtype, rounded up, so that no pair within the exact sum is lost."""
+    if skin == 0:
+        return float(cutoff)
+    exact = Fraction(cutoff) + Fraction(skin)
+    radius = dtype.type(cutoff) + dtype.type(skin)
+    while math.isfinite(radius) and Fraction(float(radius)) < exact:
+        radius = np.nextafter(radius, dtype.type(np.inf))
+    return float(radius)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -103,9 +115,71 @@ class Problem:
             known = not any(isinstance(x, Tracer) for x in jax.tree.leaves(inputs))
             refuse_status(status, inputs.box, self.options.images, reach, name_culprits(status, inputs) if known else "")
 
-    def with_images(self, images: Images | None) -> "Problem":
-        """Return the same problem with other images."""
-        return dataclasses.replace(self, options=self.options._replace(images=images))
+
+class KeptOptions:
+    """The options of a search, read from the problem that a list holds. They do not change."""
+
+    problem: Problem
+
+    @property
+    def cutoff(self) -> float | None:
+        """Interaction radius [length], rounded to the dtype of the positions; None with cutoffs per particle."""
+        return self.problem.cutoff
+
+    @property
+    def skin(self) -> float:
+        """Verlet skin [length]."""
+        return self.problem.skin
+
+    @property
+    def half(self) -> bool:
+        """Whether each unordered pair is listed once, in the row of its smaller index."""
+        return self.problem.options.filter.later_only
+
+    @property
+    def include_self(self) -> bool:
+        """Whether each particle is its own neighbor."""
+        return self.problem.include_self
+
+    @property
+    def closed(self) -> bool:
+        """Whether pairs at exactly the cutoff count."""
+        return self.problem.options.closed
+
+    @property
+    def own_queries(self) -> bool:
+        """Whether rows belong to separate `queries` instead of the positions."""
+        return self.problem.own_queries
+
+    @property
+    def masked(self) -> bool:
+        """Whether particles may be inactive."""
+        return self.problem.masked
+
+    @property
+    def box_kind(self) -> Images | None:
+        """The periodic axes and the images that the search considers; None in open space."""
+        return self.problem.options.images
+
+    @property
+    def source_count(self) -> int:
+        """n, the fill value of unused slots."""
+        return self.problem.source_count
+
+    @property
+    def dim(self) -> int:
+        """Dimension of the positions, 2 or 3."""
+        return self.problem.dim
+
+    @property
+    def dtype(self) -> np.dtype:
+        """Dtype of the positions."""
+        return self.problem.dtype
+
+    @property
+    def backend(self) -> str:
+        """Name of the engine that made the list."""
+        return self.problem.options.engine.name
 
 
 class Asked(NamedTuple):
@@ -153,7 +227,8 @@ def check_problem(asked: Asked) -> tuple["Problem", Inputs]:
     systems = None if asked.batch is None else check_batch(asked.batch, sources, queries)
     ordered = has_order(engine, platform_of(sources), sources.shape[0], queries is None and radii is None)
     static_reach = reach if engine.static_radius else None
-    sources, queries = real_points(sources, queries, box, systems, engine.native)
+    if box is not None and box.fractional:
+        sources, queries = real_points(sources, queries, box, systems, engine.native)
     options = Options(keep, engine, closed, 0.0 if radii is None else skin, images, static_reach, ordered)
     shape = {"own_queries": queries is not None, "masked": active is not None, "source_count": sources.shape[0]}
     problem = Problem(options, radius, skin, **shape, dim=sources.shape[1], dtype=dtype)

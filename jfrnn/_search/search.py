@@ -1,6 +1,7 @@
 """The public functions `search`, `search_edges` and `count`."""
 
 import dataclasses
+import functools
 
 import jax
 from jax import Array
@@ -10,10 +11,10 @@ from jfrnn._engine import Inputs, count_rows, mark_counts
 from jfrnn._geometry import Box, check_capacity, check_flag, check_slack, known_status
 from jfrnn._search.edge_list import EdgeList, count_total
 from jfrnn._search.exports import check_total
-from jfrnn._search.making import count_capacity, find_fields, find_flat_fields
+from jfrnn._search.making import count_capacity, find_fields
 from jfrnn._search.neighbor_list import NeighborList
+from jfrnn._search.present import MOST_SLOTS
 from jfrnn._search.problem import Asked, check_problem
-from jfrnn._search.reverse import MOST_SLOTS
 from jfrnn._tracing import (
     AnyCutoff,
     Backend,
@@ -102,7 +103,8 @@ def search(
     if reverse and rows * capacity > MOST_SLOTS:
         raise ValueError(f"reverse=True numbers slots by int32, got {rows} rows of {capacity} slots: search without.")
     with own_transfers():
-        fields = call_apart(lambda inputs: find_fields(inputs, problem.options, capacity, problem.skin > 0, reverse), inputs)
+        given = {"room": capacity, "moving": problem.skin > 0, "reversing": reverse, "flat": False}
+        fields = call_apart(functools.partial(find_fields, options=problem.options, **given), inputs)
     return NeighborList(**fields, problem=problem)
 
 
@@ -175,7 +177,8 @@ def search_edges(
         total = count_total(inputs, problem.options, slack)
     total = check_total(total)
     with own_transfers():
-        fields = call_apart(lambda inputs: find_flat_fields(inputs, problem.options, total, problem.skin > 0, reverse), inputs)
+        given = {"room": total, "moving": problem.skin > 0, "reversing": reverse, "flat": True}
+        fields = call_apart(functools.partial(find_fields, options=problem.options, **given), inputs)
     return EdgeList(**fields, problem=problem)
 
 
@@ -216,7 +219,7 @@ def count(
     options = (radius_rule, species, exclude, half, include_self, closed, backend, 0.0, active)
     problem, inputs = check_problem(Asked(positions, cutoff, queries, box, batch, *options))
     with own_transfers():
-        counts, _, status = call_apart(lambda inputs: count_rows(inputs, problem.options), inputs)
+        counts, _, status = call_apart(functools.partial(count_rows, options=problem.options), inputs)
         known = known_status(status)
         if known is None:
             return call_apart(mark_counts, inputs, counts, status)

@@ -6,8 +6,6 @@ cutoff + skin (triangle inequality), so it is listed (Verlet 1967, doi:10.1103/P
 
 import dataclasses
 import functools
-import math
-from fractions import Fraction
 
 import jax
 import jax.numpy as jnp
@@ -52,15 +50,6 @@ class Verlet:
     box: Box | None
     radii: Radii | None
     rebuild_count: Array
-
-
-def list_radius(cutoff: float, skin: float, dtype: np.dtype) -> float:
-    """Return cutoff + skin, both of this dtype, rounded up, so that no pair within the exact sum is lost."""
-    exact = Fraction(cutoff) + Fraction(skin)
-    radius = dtype.type(cutoff) + dtype.type(skin)
-    while math.isfinite(radius) and Fraction(float(radius)) < exact:
-        radius = np.nextafter(radius, dtype.type(np.inf))
-    return float(radius)
 
 
 def has_moved_too_far(

@@ -18,7 +18,7 @@ from jfrnn._triangles.cells import LANES, MOST_CELLS, TriangleCells, bucket_coun
 from jfrnn._triangles.cells import sort_triangles as sort_by_jax
 from jfrnn._triangles.rows import decide_pairs as decide_by_jax
 from jfrnn._triangles.tree import WIDTH, TriangleTree, boxes_around, level_starts
-from jfrnn.kernels import triangle_pairs_cpu, triangles_cpu, triangles_cuda, winding
+from jfrnn.kernels import triangles, triangles_cuda
 
 _LONGEST_VECTOR = 16
 _PARTICLES_PER_THREAD = 1024  # below, a second thread costs more than it saves
@@ -103,8 +103,8 @@ def _name(name: str, variant: _Variant) -> str:
     return f"jfrnn_triangles_{name}_{variant.dim}d_{'f64' if variant.double else 'f32'}{options}"
 
 
-def _kernels(variant: _Variant) -> triangles_cpu.Kernels:
-    return triangles_cpu.triangle_kernels(*variant, MOST_CELLS[variant.dim], LANES[variant.dim], WIDTH)
+def _kernels(variant: _Variant) -> triangles.Kernels:
+    return triangles.triangle_kernels(*variant, MOST_CELLS[variant.dim], LANES[variant.dim], WIDTH)
 
 
 _CELLS = ("start", "triangles", "levels", "level_count", "level_of")
@@ -182,7 +182,7 @@ def decide_pairs(own: Array, corners: Array, particle: Array, triangle: Array, c
 def _pairs_on_cpu(dim: int, double: bool) -> Call:
     def plan(shapes: Shapes, multiprocessors: int) -> Plan:
         (n,) = shapes["particle"]
-        query = share(triangle_pairs_cpu.pairs_kernel(dim, double), n, triangle_pairs_cpu.CHUNK)
+        query = share(triangles.pairs_kernel(dim, double), n, triangles.PAIRS_CHUNK)
         return Plan([Clear("info", 4), query], {"n": n})
 
     given = "positions", "corners", "cutoff", "particle", "triangle", "asked"
@@ -192,9 +192,9 @@ def _pairs_on_cpu(dim: int, double: bool) -> Call:
 
 def _rays_callable(dim: int, double: bool, cuda: bool) -> Call:
     def plan(shapes: Shapes, multiprocessors: int) -> Plan:
-        n, side = shapes["positions"][0], winding.side_kernel(dim, double, WIDTH, cuda)
+        n, side = shapes["positions"][0], triangles.side_kernel(dim, double, WIDTH, cuda)
         numbers = {"n": n, "levels": shapes["start"][0] - 1, "entries": shapes["boxes"][1]}
-        return Plan([Launch(side, n)] if cuda else [Clear("info", 4), share(side, n, winding.CHUNK)], numbers)
+        return Plan([Launch(side, n)] if cuda else [Clear("info", 4), share(side, n, triangles.POINTS_CHUNK)], numbers)
 
     given = "positions", "corners", "boxes", "cutoff", "rays", "start", "triangles", "asked", "least"
     name = f"jfrnn_winding_{'cuda' if cuda else 'cpu'}_{dim}d_{'f64' if double else 'f32'}"

@@ -14,7 +14,7 @@ import pytest
 from jfrnn._engine import Clear, Launch, Plan, launch, plans
 from jfrnn._engine.start import load_warp
 from jfrnn.kernels import Field, Kernel, Program, _compile, _driver
-from jfrnn.kernels.launch import write_launcher
+from jfrnn.kernels._compile import write_launcher
 
 HEADER = (Path(jax.ffi.include_dir()) / "xla" / "ffi" / "api" / "c_api.h").read_text()
 HARNESS = r"""

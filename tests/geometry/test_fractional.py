@@ -13,7 +13,7 @@ from test_boxes import oracle as oracle_of_systems
 
 import jfrnn
 import jfrnn.distributed
-from jfrnn._search.fractional import real_points
+from jfrnn._search.geometry import real_points
 
 SLOW = pytest.mark.slow
 SKEWED = np.array([[1.0, 0.0, 0.0], [0.45, 0.9, 0.0], [-0.3, 0.35, 1.1]])

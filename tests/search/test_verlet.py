@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import jfrnn
-from jfrnn._search.verlet import list_radius
+from jfrnn._search.problem import list_radius
 
 CUTOFF, SKIN = 0.3, 0.1
 

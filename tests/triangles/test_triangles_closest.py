@@ -20,7 +20,7 @@ from jfrnn._triangles.tree import WIDTH, grow_tree, level_starts
 from jfrnn._triangles.winding import cast_rays, is_closed, least_winding, ray_ways
 from jfrnn.cases import meshes
 from jfrnn.cases.triangles import TRIANGLE_CASES, padded
-from jfrnn.kernels import _compile, winding
+from jfrnn.kernels import _compile, triangles
 
 KINDS = [pytest.param(np.float32, 3, id="f32-3d"), pytest.param(np.float64, 2, id="f64-2d", marks=pytest.mark.slow)]
 PAIRS = 400
@@ -396,7 +396,7 @@ def test_rays_through_a_tree_of_many_levels():
 def test_kernel_for_cuda(dim, dtype):
     """It compiles for a GPU, nothing contracted; its text for the CPU tells the sides, too."""
     double = dtype == np.float64
-    program = _compile.find_binary(winding.side_kernel(dim, double, WIDTH, cuda=True).program, arch=90).read_text()
+    program = _compile.find_binary(triangles.side_kernel(dim, double, WIDTH, cuda=True).program, arch=90).read_text()
     assert not re.search(r"\bfma\.|\b(mul|add|sub)\.f(32|64)", program)
     vertices, faces = joined(*walls(dim)["crossing"])
     vertices, x = vertices.astype(dtype), around(dim, dtype)
@@ -407,7 +407,7 @@ def test_kernel_for_cuda(dim, dtype):
     given |= {"asked": np.ones(len(x), np.int32), "least": np.ones(1, np.int32), "side": side, "info": np.zeros(1, np.int32)}
     arrays = {name: np.ascontiguousarray(array) for name, array in given.items()}
     sizes = {"n": len(x), "levels": len(arrays["start"]) - 1, "entries": tri.cells.boxes.shape[1]}
-    launched.on_cpu(winding.side_kernel(dim, double, WIDTH, cuda=False), **arrays, **sizes)
+    launched.on_cpu(triangles.side_kernel(dim, double, WIDTH, cuda=False), **arrays, **sizes)
     inside, on_face = expected_side(x, vertices, faces)
     assert np.array_equal(side[~on_face], inside[~on_face])
 

@@ -24,7 +24,7 @@ from jfrnn._triangles.warp import _Variant, query_inputs, sizes_on_cuda
 from jfrnn.cases import meshes
 from jfrnn.cases.triangles import TRIANGLE_CASES, padded
 from jfrnn.kernels import Program, _compile, triangles_cuda
-from jfrnn.kernels._triangles import pending
+from jfrnn.kernels.triangles import pending
 
 KINDS = list(product((np.float32, np.float64), (2, 3)))
 OFTEN = {"warp": [(np.float32, 3), (np.float64, 2)], "bvh": [(np.float32, 2), (np.float64, 3)]}

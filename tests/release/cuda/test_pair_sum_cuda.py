@@ -12,7 +12,7 @@ import pytest
 
 import jfrnn
 from jfrnn._engine import boxes_warp, warp_sums
-from jfrnn._engine.variants import SUMS, names_of_cutoffs, names_of_tree
+from jfrnn._engine.operands import SUMS, names_of_cutoffs, names_of_tree
 from jfrnn._search.problem import Asked, check_problem
 from jfrnn._sums import fused as _fused
 from jfrnn._sums.verb import _with_engine

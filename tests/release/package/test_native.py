@@ -12,9 +12,9 @@ from places import ROOT
 from jfrnn._engine import ffi
 from jfrnn._engine.start import load_warp
 from jfrnn.kernels import Program, _compile
+from jfrnn.kernels._compile import write_launcher
 from jfrnn.kernels._text import resolve
 from jfrnn.kernels.hashgrid import warp_header
-from jfrnn.kernels.launch import write_launcher
 
 NATIVE = ROOT / "kernels" / "native"
 LAUNCHING = ("calls.h", "desk.h", "launch.h")  # which need XLA's header
