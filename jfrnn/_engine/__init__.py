@@ -10,7 +10,6 @@ from jfrnn._engine.auto import (
     parse_backend,
     platform_of,
 )
-from jfrnn._engine.few_counts import count_few
 from jfrnn._engine.kept_warp import KeptList, kept_distances, kept_mask, kept_slopes, kept_sums
 from jfrnn._engine.launch import Call, Shapes, kernel
 from jfrnn._engine.operands import MOST_IN_BOX, as_float
@@ -33,7 +32,7 @@ from jfrnn._engine.reverse_warp import collect_slots, flatten_slots, reverse_slo
 from jfrnn._engine.rows import add_up, count_rows, find_rows, fold_pairs, list_flat, list_rows, mark_counts
 from jfrnn._engine.runs import FOLD_GROUP, Block, Slots, Visit
 from jfrnn._engine.start import compiler, level_of_caller
-from jfrnn._engine.structure import Structure, find_structure_pairs
+from jfrnn._engine.structure import Structure, count_few, find_structure_pairs
 from jfrnn._engine.sum_results import FoundSums, Summed
 from jfrnn._engine.warp import PLATFORMS, has_order
 from jfrnn._engine.warp_sums import pair_sums

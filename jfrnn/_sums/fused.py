@@ -115,10 +115,14 @@ def _kind(inputs: Inputs) -> tuple[np.dtype, tuple[bool, ...]]:
     return np.dtype(inputs.sources.dtype), (False,) * inputs.sources.shape[1] if inputs.box is None else inputs.box.periodic
 
 
+# dtypes whose values the kernel holds exactly in columns of a dtype
+_EXACT = {"float32": ("float32", "bool", "int32"), "float64": ("float32", "float64", "bool", "int32", "int64")}
+
+
 @functools.lru_cache(maxsize=256)
 def _why_not(term: Term, dtype: np.dtype, periodic: tuple[bool, ...]) -> Exception | None:
     for what, specs in (("fn returns", term.summands), ("fn gets or closes over", sum(term.operands, ()))):
-        known = {dtype} if what == "fn returns" else _exact_dtypes(dtype)
+        known = {dtype} if what == "fn returns" else set(map(np.dtype, _EXACT[dtype.name]))
         for spec in specs:
             if spec.dtype not in known:
                 names = ", ".join(sorted(x.name for x in known))
@@ -131,12 +135,6 @@ def _why_not(term: Term, dtype: np.dtype, periodic: tuple[bool, ...]) -> Excepti
     except NoTranslationError as error:
         return error
     return None
-
-
-def _exact_dtypes(dtype: np.dtype) -> set[np.dtype]:
-    """Return the dtypes whose values the kernel can hold exactly in columns of this dtype."""
-    names = ("float32", "bool", "int32") if dtype == np.float32 else ("float32", "float64", "bool", "int32", "int64")
-    return {np.dtype(name) for name in names}
 
 
 @functools.lru_cache(maxsize=256)

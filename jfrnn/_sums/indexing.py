@@ -11,8 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
-from jfrnn._sums.equation import Equation, Rule, Values
-from jfrnn._sums.scalars import NoTranslationError
+from jfrnn._sums.scalars import Equation, NoTranslationError, Rule, Values
 
 MOST_PLACES = 64  # most places to which data may say that something is added; the gradient of a table has one sum for each
 

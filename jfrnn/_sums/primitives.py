@@ -10,9 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from jfrnn._sums.equation import Equation, Rule, Values
 from jfrnn._sums.indexing import add_window, choose, dynamic_slice, dynamic_update_slice, gather, scatter, set_window
-from jfrnn._sums.scalars import NoTranslationError, Number
+from jfrnn._sums.scalars import Equation, NoTranslationError, Number, Rule, Values
 
 MOST_REPEATED = 8  # largest constant exponent of `pow` that becomes repeated multiplication, within a few ulp
 
@@ -34,10 +33,6 @@ def _same(_: Equation, inputs: list[Values]) -> list[Values]:
 # --- element-wise -----------------------------------------------------------------------------------------------------
 
 
-def _convert(eqn: Equation, inputs: list[Values]) -> list[Values]:
-    return [eqn.cast(inputs[0], eqn.outputs[0].dtype)]
-
-
 def _power(eqn: Equation, inputs: list[Values]) -> list[Values]:
     (x, y), dtype = inputs, eqn.outputs[0].dtype
     if not dtype.startswith("float"):
@@ -47,10 +42,6 @@ def _power(eqn: Equation, inputs: list[Values]) -> list[Values]:
     if exponent is not None and abs(exponent) <= MOST_REPEATED and exponent == int(exponent):
         return [_repeat(eqn, np.broadcast_to(x, eqn.outputs[0].shape), int(exponent))]
     return [eqn.each("pow", x, eqn.cast(y, dtype))]
-
-
-def _integer_power(eqn: Equation, inputs: list[Values]) -> list[Values]:
-    return [_repeat(eqn, inputs[0], eqn.params["y"])]
 
 
 def _repeat(eqn: Equation, x: Values, exponent: int) -> Values:
@@ -64,11 +55,6 @@ def _repeat(eqn: Equation, x: Values, exponent: int) -> Values:
             square = eqn.each("mul", square, square)
     result = np.broadcast_to(result, x.shape)
     return eqn.each("div", eqn.full(1), result) if exponent < 0 else result
-
-
-def _round(eqn: Equation, inputs: list[Values]) -> list[Values]:
-    away = int(eqn.params["rounding_method"]) == 0
-    return [eqn.each("round" if away else "round_even", *inputs)]
 
 
 def _select(eqn: Equation, inputs: list[Values]) -> list[Values]:
@@ -99,30 +85,17 @@ def _reduce(operation: str, empty: Callable[[np.dtype], Number]) -> Rule:
     return rule
 
 
-def _least(dtype: np.dtype) -> Number:
-    return -np.inf if dtype.kind == "f" else False if dtype.kind == "b" else np.iinfo(dtype).min
-
-
-def _most(dtype: np.dtype) -> Number:
-    return np.inf if dtype.kind == "f" else True if dtype.kind == "b" else np.iinfo(dtype).max
-
-
 def _accumulate(operation: str) -> Rule:
     """Return the rule of a running reduction along an axis."""
 
     def rule(eqn: Equation, inputs: list[Values]) -> list[Values]:
-        backward = slice(None, None, -1 if eqn.params["reverse"] else 1)
-        slices = list(np.moveaxis(inputs[0], eqn.params["axis"], 0)[backward])
-        for k in range(1, len(slices)):
-            slices[k] = eqn.each(operation, slices[k - 1], slices[k])
-        return [np.moveaxis(np.array(slices, int).reshape(-1, *_rest_shape(inputs[0].shape, eqn))[backward], 0, eqn.params["axis"])]
+        backward, axis = slice(None, None, -1 if eqn.params["reverse"] else 1), eqn.params["axis"]
+        result = np.moveaxis(inputs[0].copy(), axis, 0)[backward]
+        for k in range(1, len(result)):
+            result[k] = eqn.each(operation, result[k - 1], result[k])
+        return [np.moveaxis(result[backward], 0, axis)]
 
     return rule
-
-
-def _rest_shape(shape: tuple[int, ...], eqn: Equation) -> tuple[int, ...]:
-    axis = eqn.params["axis"]
-    return shape[:axis] + shape[axis + 1 :]
 
 
 def _dot_general(eqn: Equation, inputs: list[Values]) -> list[Values]:
@@ -152,11 +125,6 @@ def _broadcast(x: Values, params: dict[str, Any]) -> Values:
     return np.broadcast_to(x.reshape(shape), params["shape"])
 
 
-def _reshape(x: Values, params: dict[str, Any]) -> Values:
-    order = params.get("dimensions")
-    return (x if order is None else x.transpose(order)).reshape(params["new_sizes"])
-
-
 def _slice(x: Values, params: dict[str, Any]) -> Values:
     strides = params["strides"] or (1,) * x.ndim
     return x[tuple(map(slice, params["start_indices"], params["limit_indices"], strides))]
@@ -164,10 +132,6 @@ def _slice(x: Values, params: dict[str, Any]) -> Values:
 
 def _split(eqn: Equation, inputs: list[Values]) -> list[Values]:
     return np.split(inputs[0], np.cumsum(eqn.params["sizes"])[:-1], eqn.params["axis"])
-
-
-def _unstack(eqn: Equation, inputs: list[Values]) -> list[Values]:
-    return list(np.moveaxis(inputs[0], eqn.params["axis"], 0))
 
 
 def _iota(eqn: Equation, _: list[Values]) -> list[Values]:
@@ -197,8 +161,8 @@ def _inline(eqn: Equation, inputs: list[Values]) -> list[Values]:
 
 def _cond(eqn: Equation, inputs: list[Values]) -> list[Values]:
     """Evaluate all branches, which have no side effects, and select one."""
-    results = [eqn.run(branch, inputs[1:]) for branch in eqn.params["branches"]]
-    return [choose(eqn, inputs[0], cases, spec.dtype) for spec, cases in zip(eqn.outputs, zip(*results, strict=True), strict=True)]
+    results = zip(*(eqn.run(branch, inputs[1:]) for branch in eqn.params["branches"]), strict=True)
+    return [choose(eqn, inputs[0], cases, spec.dtype) for spec, cases in zip(eqn.outputs, results, strict=True)]
 
 
 # --- all of it --------------------------------------------------------------------------------------------------------
@@ -218,10 +182,10 @@ TABLE: dict[str, Rule] = {name: _each(name) for name in _SAME_NAME} | {
     "not": _each("inverse"),
     "square": lambda eqn, inputs: [eqn.each("mul", inputs[0], inputs[0])],
     "pow": _power,
-    "integer_pow": _integer_power,
-    "round": _round,
+    "integer_pow": lambda eqn, inputs: [_repeat(eqn, inputs[0], eqn.params["y"])],
+    "round": lambda eqn, inputs: [eqn.each("round_even" if int(eqn.params["rounding_method"]) else "round", *inputs)],
     "select_n": _select,
-    "convert_element_type": _convert,
+    "convert_element_type": lambda eqn, inputs: [eqn.cast(inputs[0], eqn.outputs[0].dtype)],
     "copy": _same,
     "copy_p": _same,
     "reshard": _same,  # for arrays that fn closes over from outside `shard_map`: every device has all of them
@@ -231,8 +195,8 @@ TABLE: dict[str, Rule] = {name: _each(name) for name in _SAME_NAME} | {
     # reductions
     "reduce_sum": _reduce("add", lambda _: 0),
     "reduce_prod": _reduce("mul", lambda _: 1),
-    "reduce_max": _reduce("max", _least),
-    "reduce_min": _reduce("min", _most),
+    "reduce_max": _reduce("max", lambda dtype: dtype.kind != "b" and (-np.inf if dtype.kind == "f" else np.iinfo(dtype).min)),
+    "reduce_min": _reduce("min", lambda dtype: dtype.kind == "b" or (np.inf if dtype.kind == "f" else np.iinfo(dtype).max)),
     "reduce_and": _reduce("both", lambda dtype: True if dtype.kind == "b" else -1),
     "reduce_or": _reduce("either", lambda _: 0),
     "reduce_xor": _reduce("differ", lambda _: 0),
@@ -244,7 +208,7 @@ TABLE: dict[str, Rule] = {name: _each(name) for name in _SAME_NAME} | {
     # moves
     "broadcast_in_dim": _move(_broadcast),
     "expand_dims": _move(lambda x, params: np.expand_dims(x, params["dimensions"])),
-    "reshape": _move(_reshape),
+    "reshape": _move(lambda x, params: x.transpose(params.get("dimensions") or range(x.ndim)).reshape(params["new_sizes"])),
     "rev": _move(lambda x, params: np.flip(x, params["dimensions"])),
     "slice": _move(_slice),
     "squeeze": _move(lambda x, params: np.squeeze(x, tuple(params["dimensions"]))),
@@ -253,7 +217,7 @@ TABLE: dict[str, Rule] = {name: _each(name) for name in _SAME_NAME} | {
     "concatenate": lambda eqn, inputs: [np.concatenate(inputs, eqn.params["dimension"])],
     "stack": lambda eqn, inputs: [np.stack(inputs, eqn.params["axis"])],
     "split": _split,
-    "unstack": _unstack,
+    "unstack": lambda eqn, inputs: list(np.moveaxis(inputs[0], eqn.params["axis"], 0)),
     "iota": _iota,
     "pad": _pad,
     "dynamic_slice": dynamic_slice,

@@ -52,11 +52,6 @@ class Searched:
         radii = self.inputs.cutoff
         return self.inputs.queries is None and not (isinstance(radii, Radii) and radii.rule in EXCHANGED)
 
-    @property
-    def finite_rows(self) -> Array:
-        """Which rows are those of finite positions."""
-        return are_finite(self.inputs.sources if self.inputs.queries is None else self.inputs.queries)
-
     def reverse(self) -> "Searched":
         """Return the same pairs with i and j exchanged and shifts negated."""
         sources, queries, active, box, cutoff, batch, exclude = self.inputs
@@ -354,7 +349,7 @@ def sum_pairs(relation: Relation, term: Term, operands: Groups, compensated: boo
     results = [adder.result(state) for state in found]
     if not isinstance(relation, Searched) or not any(term.marks):
         return results
-    good = relation.finite_rows
+    good = are_finite(relation.inputs.sources if relation.inputs.queries is None else relation.inputs.queries)
     return [mark_rows(x, good) if mark else x for x, mark in zip(results, term.marks, strict=True)]
 
 

@@ -90,8 +90,12 @@ def split_operands(operands: Sequence, like: Groups) -> Groups:
 
 def _jaxpr_of(summand: Summand, operands: Groups, shift: jax.ShapeDtypeStruct) -> ClosedJaxpr:
     """Trace the summand of one pair, with matrix products in full precision, where GPUs would use TF32 by default."""
+
+    def flat(real: Array, shift: Array, *flat: Array) -> list[Array]:
+        return [jnp.asarray(x) for x in summand(real, shift, split_operands(flat, operands))]
+
     with jax.default_matmul_precision("highest"):
-        return jax.make_jaxpr(_flat(summand, operands))(*_one_pair(operands, shift))
+        return jax.make_jaxpr(flat)(jax.ShapeDtypeStruct((), np.bool_), shift, *sum(operands, ()))
 
 
 def trace(
@@ -183,14 +187,6 @@ def fresh_labels(count: int, labels: Labels) -> tuple[int, ...]:
     """Return labels that are not in use."""
     first = max((*labels[0], *labels[1], *POSITIONS)) + 1
     return tuple(range(first, first + count))
-
-
-def _one_pair(operands: Groups, shift: jax.ShapeDtypeStruct) -> list[jax.ShapeDtypeStruct]:
-    return [jax.ShapeDtypeStruct((), np.bool_), shift, *operands.shared, *operands.own, *operands.others]
-
-
-def _flat(summand: Summand, operands: Groups) -> Callable[..., list[Array]]:
-    return lambda real, shift, *flat: [jnp.asarray(x) for x in summand(real, shift, split_operands(flat, operands))]
 
 
 def choose(operands: Groups, flags: Groups) -> Groups:

@@ -20,10 +20,9 @@ import numpy as np
 from jax.core import Tracer
 from jax.extend.core import ClosedJaxpr, Literal
 
-from jfrnn._sums.equation import Equation, Spec, Values
 from jfrnn._sums.factors import factor_out
 from jfrnn._sums.primitives import TABLE
-from jfrnn._sums.scalars import TYPES, NoTranslationError, Scalars, hash_of
+from jfrnn._sums.scalars import TYPES, Equation, NoTranslationError, Scalars, Spec, Values, hash_of
 from jfrnn._tracing import Aval, Given, Internal
 
 MOST_ELEMENTS = 256  # most elements of an array
@@ -154,11 +153,9 @@ def _run(scalars: Scalars, nested: Internal, inputs: Sequence[Values]) -> list[V
     known |= {var: _constants(scalars, x) for var, x in zip(jaxpr.constvars, consts, strict=True)}
 
     def read(atom: Internal) -> Values:
-        return (
-            _constants(scalars, np.asarray(atom.val, _spec(atom.aval, "a constant").dtype))
-            if isinstance(atom, Literal)
-            else known[atom]
-        )
+        if not isinstance(atom, Literal):
+            return known[atom]
+        return _constants(scalars, np.asarray(atom.val, _spec(atom.aval, "a constant").dtype))
 
     def run(nested: Internal, inputs: Sequence[Values]) -> list[Values]:
         return _run(scalars, nested, inputs)

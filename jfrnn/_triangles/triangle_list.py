@@ -28,11 +28,9 @@ from jfrnn._geometry import (
 from jfrnn._search import norms, round_capacity
 from jfrnn._tracing import IndexRows, Points, Real, as_array, call_apart, compile_program, own_transfers
 from jfrnn._triangles.cells import TriangleCells, gather_corners
-from jfrnn._triangles.closest import Rows, nearest_of, pseudonormals
-from jfrnn._triangles.contacts import are_contacts
+from jfrnn._triangles.closest import Rows, are_contacts, nearest_of, pseudonormals
 from jfrnn._triangles.crossings import are_crossed
-from jfrnn._triangles.engines import TRIANGLE_ENGINES, TriangleEngine
-from jfrnn._triangles.programs import count_slots, find_fields
+from jfrnn._triangles.engines import TRIANGLE_ENGINES, TriangleEngine, count_slots, find_fields
 from jfrnn._triangles.rows import are_near, nearest_slots
 from jfrnn._triangles.tree import TriangleTree, grow_tree
 from jfrnn._triangles.winding import is_closed, least_winding, ray_ways

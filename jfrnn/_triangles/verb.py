@@ -9,8 +9,7 @@ from jax.core import Tracer
 from jfrnn._engine import ARRAYS, PLATFORMS, WARP, choose_engine, parse_backend, platform_of
 from jfrnn._geometry import check_capacity, check_cutoff, check_positions, check_slack
 from jfrnn._tracing import Given, IndexRows, Number, Points, Real, Size, as_array, gather, make_on_host
-from jfrnn._triangles.engines import TRIANGLE_ENGINES, TriangleEngine, fastest_of
-from jfrnn._triangles.programs import count_slots, find_fields
+from jfrnn._triangles.engines import TRIANGLE_ENGINES, TriangleEngine, count_slots, fastest_of, find_fields
 from jfrnn._triangles.triangle_list import TriangleList
 from jfrnn._triangles.winding import is_closed
 

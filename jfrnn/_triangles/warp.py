@@ -4,7 +4,6 @@ They look for triangles in cells, which on CUDA are those of `jfrnn._triangles.c
 """
 
 import functools
-from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -155,10 +154,11 @@ def cast_rays(
     radius, starts = jnp.reshape(jnp.asarray(cutoff.radius), 1), jnp.asarray(level_starts(len(corners)))
     inputs = points, corners, tree.boxes, radius, rays, starts, tree.triangles, asked.astype(jnp.int32), jnp.reshape(least, 1)
 
-    def call(of: Callable[[int, bool], Callable[..., Sequence[Array]]], *given: Array) -> Array:
-        return of(points.shape[1], bool(points.dtype == jnp.float64))(*given, output_dims={"side": len(points), "info": 1})[0]
+    def call(cuda: bool, *given: Array) -> Array:
+        find = _rays_callable(points.shape[1], bool(points.dtype == jnp.float64), cuda)
+        return find(*given, output_dims={"side": len(points), "info": 1})[0]
 
-    on_cpu, on_cuda = (functools.partial(call, of) for of in (_rays_on_cpu, _rays_on_cuda))
+    on_cpu, on_cuda = (functools.partial(call, cuda) for cuda in (False, True))
     side = on_platform(*inputs, cpu=on_cpu, cuda=on_cuda)
     return side == 1, side == 2
 
@@ -190,6 +190,7 @@ def _pairs_on_cpu(dim: int, double: bool) -> Call:
     return Call(name, given, dict.fromkeys(("near", "info"), np.int32), plan)
 
 
+@kernel
 def _rays_callable(dim: int, double: bool, cuda: bool) -> Call:
     def plan(shapes: Shapes, multiprocessors: int) -> Plan:
         n, side = shapes["positions"][0], triangles.side_kernel(dim, double, WIDTH, cuda)
@@ -199,13 +200,3 @@ def _rays_callable(dim: int, double: bool, cuda: bool) -> Call:
     given = "positions", "corners", "boxes", "cutoff", "rays", "start", "triangles", "asked", "least"
     name = f"jfrnn_winding_{'cuda' if cuda else 'cpu'}_{dim}d_{'f64' if double else 'f32'}"
     return Call(name, given, dict.fromkeys(("side", "info"), np.int32), plan)
-
-
-@kernel
-def _rays_on_cpu(dim: int, double: bool) -> Call:
-    return _rays_callable(dim, double, cuda=False)
-
-
-@kernel
-def _rays_on_cuda(dim: int, double: bool) -> Call:
-    return _rays_callable(dim, double, cuda=True)
