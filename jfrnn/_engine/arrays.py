@@ -21,33 +21,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
+from jfrnn import _geometry as geometry
 from jfrnn._engine.boxes import find_in_boxes
 from jfrnn._engine.candidates import NOWHERE, Candidates, Excluded, Points, Span, Torus
 from jfrnn._engine.problem import Features, Options, Room, Rows, Search, largest_radius
 from jfrnn._engine.runs import State, count_neighbors, fill_neighbors, list_neighbors
 from jfrnn._engine.tuning import Tuning, by_platform
 from jfrnn._engine.words import CHUNK, LANES
-from jfrnn._geometry import (
-    FINE,
-    CellAxes,
-    Cells,
-    Cutoff,
-    Cutoffs,
-    ExcludedCodes,
-    Lattice,
-    Part,
-    Status,
-    Wrapped,
-    cell_edge,
-    fractions_of,
-    line_runs,
-    open_axes,
-    parts_of,
-    sort_along_line,
-    sort_queries,
-    translation,
-    unpack_turns,
-)
 from jfrnn._tracing import call_late, largest_of
 
 _MOST_SOURCES = 2**30 - LANES  # whose places are int32, as runs read the sources twice in a row
@@ -157,7 +137,7 @@ def complete_rows(search: Search, idx: Array | None, count: Array, capacity: int
     required = largest_of(count)
     finite = jnp.isfinite(search.sources).all() & (True if search.queries is None else jnp.isfinite(search.queries).all())
     overflow = False if capacity is None else required > capacity
-    status = jnp.where(overflow, Status.ROW_OVERFLOW.value, 0) | jnp.where(finite, 0, Status.NONFINITE.value)
+    status = jnp.where(overflow, geometry.Status.ROW_OVERFLOW.value, 0) | jnp.where(finite, 0, geometry.Status.NONFINITE.value)
     return Rows(idx, count, required, status.astype(jnp.int32))
 
 
@@ -172,10 +152,10 @@ def fold_candidates(
         return step(_complete(search, find_in_boxes(search, by_cells)), state)
     if not by_cells:
         return step(_complete(search, _all_sources(search)), state)
-    if isinstance(search.cutoff, Cutoff):
+    if isinstance(search.cutoff, geometry.Cutoff):
         return step(_complete(search, _cell_stencil(search, tuning)), state)
     there = (search.sources, search.sources if search.queries is None else search.queries)
-    parts = parts_of(search.cutoffs.of_cells, *(jnp.isfinite(x).all(axis=1) for x in there))
+    parts = geometry.parts_of(search.cutoffs.of_cells, *(jnp.isfinite(x).all(axis=1) for x in there))
 
     def take(now: tuple[Array, State]) -> tuple[Array, State]:
         number, state = now
@@ -201,7 +181,7 @@ def _places_of(candidates: Candidates) -> Array:
     return jnp.full(n, NOWHERE, jnp.int32).at[ids].set(place, mode="drop")
 
 
-def _place_excluded(candidates: Candidates, exclude: ExcludedCodes) -> Excluded:
+def _place_excluded(candidates: Candidates, exclude: geometry.ExcludedCodes) -> Excluded:
     """Return where excluded sources stand among the candidates; those that stand nowhere are placed before all others."""
     found = _places_of(candidates)[exclude.others]
     if exclude.codes is None or candidates.torus is not None:
@@ -217,7 +197,7 @@ def _clouds(search: Search) -> tuple[Array, Array | None, Torus | None]:
     return wrapped.sources, None if search.queries is None else wrapped.queries, _torus(*search.torus, search.sources.dtype)
 
 
-def _cells_along(search: Search, scale: Array | None) -> tuple[Array, CellAxes]:
+def _cells_along(search: Search, scale: Array | None) -> tuple[Array, geometry.CellAxes]:
     """Return coordinates [d, n + m] along the axes that cells divide, sources first, and how the axes are divided.
 
     Cells are as wide as the cutoff, or as the largest cutoff times `scale`.
@@ -231,13 +211,13 @@ def _cells_along(search: Search, scale: Array | None) -> tuple[Array, CellAxes]:
             wrapped = wrapped._replace(reach=reach)
         return _cells_of_lattice(sources, queries, radius, lattice, wrapped)
     points = sources if queries is None else jnp.concatenate([sources, queries])
-    return points.T, open_axes(cell_edge(radius), points.shape[1])
+    return points.T, geometry.open_axes(geometry.cell_edge(radius), points.shape[1])
 
 
-def _torus(lattice: Lattice, wrapped: Wrapped, dtype: np.dtype) -> Torus:
-    turns = tuple(unpack_turns(x, lattice.dim).astype(dtype) for x in (wrapped.turns, wrapped.query_turns))
+def _torus(lattice: geometry.Lattice, wrapped: geometry.Wrapped, dtype: np.dtype) -> Torus:
+    turns = tuple(geometry.unpack_turns(x, lattice.dim).astype(dtype) for x in (wrapped.turns, wrapped.query_turns))
     shifts = jnp.asarray(lattice.images.shifts).astype(dtype)
-    return Torus(lattice.images, translation(shifts, lattice), lattice.given, (turns[0], turns[1]), wrapped.slack)
+    return Torus(lattice.images, geometry.translation(shifts, lattice), lattice.given, (turns[0], turns[1]), wrapped.slack)
 
 
 def _all_sources(search: Search) -> Candidates:
@@ -259,7 +239,7 @@ def _all_sources(search: Search) -> Candidates:
         codes = None if torus is None else jnp.zeros_like(start) + lax.iota(jnp.int32, images)[None]
         return start, jnp.broadcast_to(stop, start.shape), codes
 
-    of_sources, of_queries = cutoff.of_points if isinstance(cutoff, Cutoffs) else (None, None)
+    of_sources, of_queries = cutoff.of_points if isinstance(cutoff, geometry.Cutoffs) else (None, None)
     words, ids = images * -(-len(sources) // LANES), lax.iota(jnp.int32, len(sources)) if order is None else order
     whole = batch is None and torus is None
     gap = (0, max(LANES, CHUNK - len(sources)) if whole else LANES)
@@ -277,7 +257,7 @@ def _all_sources(search: Search) -> Candidates:
     return Candidates(points, rows, runs, torus, n, of_capacity, in_order=unordered, most_words=words, whole=whole)
 
 
-def _cell_stencil(search: Search, tuning: Tuning, part: Part | None = None) -> Candidates:
+def _cell_stencil(search: Search, tuning: Tuning, part: geometry.Part | None = None) -> Candidates:
     """Sort sources and queries by cell; the runs of a query are the rows of cells around its own.
 
     With a part, cells are as wide as its cutoffs ask for, and hold its sources and queries alone.
@@ -290,14 +270,14 @@ def _cell_stencil(search: Search, tuning: Tuning, part: Part | None = None) -> C
             queries, along = sources, jnp.concatenate([along, along], axis=1)
             systems = None if systems is None else jnp.concatenate([systems, systems])
         along = jnp.where(jnp.concatenate([part.sources, part.queries]), along, jnp.nan)
-    line, cells = sort_along_line(along, axes, n, systems, tuning.sorting)
-    numbers, order = (line.numbers, line.order) if queries is None else sort_queries(cells, n, tuning.sorting)
+    line, cells = geometry.sort_along_line(along, axes, n, systems, tuning.sorting)
+    numbers, order = (line.numbers, line.order) if queries is None else geometry.sort_queries(cells, n, tuning.sorting)
     images = None if torus is None else torus.images
     ordered = None if images is None else cells.of(order if queries is None else order + n)
 
     def runs(span: Span, _: Array) -> tuple[Array, Array, Array | None]:
         along = cells.along if ordered is None else span.of(ordered.along)  # in open space, the number says all
-        return line_runs(line, Cells(along, span.of(numbers)), images)
+        return geometry.line_runs(line, geometry.Cells(along, span.of(numbers)), images)
 
     twice = line.twice(more=LANES)
     points = _in_order(sources, twice)._replace(systems=None if batch is None else batch.sources[twice])
@@ -309,7 +289,7 @@ def _cell_stencil(search: Search, tuning: Tuning, part: Part | None = None) -> C
     return found if part is None else _of_part(found, search.cutoffs, part, own)
 
 
-def _of_part(found: Candidates, cutoffs: Cutoffs, part: Part, own: bool) -> Candidates:
+def _of_part(found: Candidates, cutoffs: geometry.Cutoffs, part: geometry.Part, own: bool) -> Candidates:
     """Add to the candidates of a part the cutoffs, and where queries that are sources stand."""
     of_sources, of_queries = cutoffs.of_points
     points, rows = found.sources, found.queries
@@ -326,29 +306,29 @@ def _stencil_words(dim: int, slots: int | None) -> int:
     Cells whose walls stand where a lattice has its sites hold up to a fifth more than the average; that fits, too.
     """
     runs, many = 3 ** (dim - 1), {2: 8, 3: 16}[dim]
-    share = (2 + 1 / FINE) * runs / {2: np.pi, 3: 4 * np.pi / 3}[dim]  # candidates per neighbor
+    share = (2 + 1 / geometry.FINE) * runs / {2: np.pi, 3: 4 * np.pi / 3}[dim]  # candidates per neighbor
     slots = {2: 32, 3: 128}[dim] if slots is None else slots
     words = math.ceil(share * slots / LANES + runs)
     return min(-(-words // many) * many, {2: 32, 3: 64}[dim])
 
 
 def _cells_of_lattice(
-    sources: Array, queries: Array | None, radius: np.floating | Array, lattice: Lattice, wrapped: Wrapped
-) -> tuple[Array, CellAxes]:
+    sources: Array, queries: Array | None, radius: np.floating | Array, lattice: geometry.Lattice, wrapped: geometry.Wrapped
+) -> tuple[Array, geometry.CellAxes]:
     """Divide a lattice cell along its vectors; open axes of an orthogonal box are divided as without a box."""
     points, packed = sources, wrapped.turns
     if queries is not None:
         points = jnp.concatenate([sources, queries])
         packed = jnp.concatenate([packed, wrapped.query_turns])
-    units, turns = fractions_of(points, lattice), unpack_turns(packed, lattice.dim).astype(points.dtype)
+    units, turns = geometry.fractions_of(points, lattice), geometry.unpack_turns(packed, lattice.dim).astype(points.dtype)
     along, edges, cells = [], [], []
     for k, periodic in enumerate(lattice.images.periodic):
         straight = lattice.images.orthogonal and not periodic
         x = points[:, k] if straight else jnp.clip(units[:, k] - turns[:, k], 0, 1) if periodic else units[:, k]
         along.append(jnp.where(packed >= 0, x, jnp.nan))
-        edges.append(cell_edge(radius if straight else wrapped.reach[k]))
+        edges.append(geometry.cell_edge(radius if straight else wrapped.reach[k]))
         cells.append(jnp.clip(jnp.floor(1 / wrapped.reach[k]), 1, 2.0**23) if periodic else None)
-    return jnp.stack(along), CellAxes(edges, cells)
+    return jnp.stack(along), geometry.CellAxes(edges, cells)
 
 
 def _in_order(positions: Array, order: Array | None, radii: Array | None = None) -> Points:

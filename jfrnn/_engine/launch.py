@@ -15,12 +15,10 @@ import hashlib
 import importlib
 import json
 import mmap
-import operator
 import os
 import platform
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from importlib.resources import files
-from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -119,17 +117,11 @@ def _decode(value: Static) -> Static:
 @functools.cache
 def _sources() -> str:
     """Return a name of the sources that decide what a kernel is given, so that it is never given what was made for another."""
-    texts = [path.read_bytes() for package in ("jfrnn", "jfrnn.kernels") for path in _files(files(package))]
+    texts = []
+    for folder in (Path(str(files(package))) for package in ("jfrnn", "jfrnn.kernels")):  # packages beneath count by themselves
+        found = (path for path in sorted(folder.rglob("*")) if path.suffix in (".py", ".h", ".cuh"))
+        texts += [path.read_bytes() for path in found if path.relative_to(folder).parts[0] not in ("cases", "kernels")]
     return hashlib.sha256(b"".join(texts)).hexdigest()[:12]
-
-
-def _files(folder: Traversable) -> Iterator[Traversable]:
-    """Yield the sources in a folder and below it; packages that are installed beneath the library are asked for by themselves."""
-    for path in sorted(folder.iterdir(), key=operator.attrgetter("name")):
-        if path.is_dir() and path.name not in ("cases", "kernels"):
-            yield from _files(path)
-        elif path.name.endswith((".py", ".h", ".cuh")):
-            yield path
 
 
 def _read_call(name: str, recipe: str) -> tuple[Call, Shapes]:

@@ -8,30 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from jfrnn._geometry import (
-    TOO_FAR,
-    Batch,
-    Box,
-    Cutoff,
-    Cutoffs,
-    ExcludedCodes,
-    Exclusions,
-    Images,
-    Lattice,
-    Radii,
-    Status,
-    Wrapped,
-    are_valid,
-    bring_near,
-    exclude_in_lattice,
-    exclude_in_space,
-    has_box,
-    is_valid,
-    make_cutoffs,
-    make_lattice,
-    rank_systems,
-    wrap,
-)
+from jfrnn import _geometry as geometry
 from jfrnn._tracing import compile_program
 
 
@@ -75,21 +52,21 @@ class Search(NamedTuple):
 
     sources: Array
     queries: Array | None
-    cutoff: Cutoff | Cutoffs
-    batch: Batch | None
-    torus: tuple[Lattice, Wrapped] | None
-    checks: dict[Status, Array]
-    exclude: ExcludedCodes | None = None
+    cutoff: geometry.Cutoff | geometry.Cutoffs
+    batch: geometry.Batch | None
+    torus: tuple[geometry.Lattice, geometry.Wrapped] | None
+    checks: dict[geometry.Status, Array]
+    exclude: geometry.ExcludedCodes | None = None
 
     @property
-    def cutoffs(self) -> Cutoffs:
+    def cutoffs(self) -> geometry.Cutoffs:
         """The cutoffs of a search with cutoffs per particle."""
-        if not isinstance(self.cutoff, Cutoffs):
+        if not isinstance(self.cutoff, geometry.Cutoffs):
             raise TypeError("this search has one cutoff for all particles.")
         return self.cutoff
 
     @property
-    def lattice(self) -> Lattice | None:
+    def lattice(self) -> geometry.Lattice | None:
         """The lattice of a periodic space, or one per system."""
         return None if self.torus is None else self.torus[0]
 
@@ -170,7 +147,7 @@ class Options(NamedTuple):
     engine: Engine
     closed: bool
     skin: float = 0.0  # to be added to cutoffs per particle; a single cutoff includes it already
-    images: Images | None = None  # the images that a search in a box considers
+    images: geometry.Images | None = None  # the images that a search in a box considers
     radius: float | None = None  # the cutoff, for an engine that has to know it while tracing
     ordered: bool = False  # whether rows are told in which order sources follow each other in space
     may_change: bool = False  # whether the array engine may sum a term that this engine cannot translate
@@ -182,10 +159,10 @@ class Inputs(NamedTuple):
     sources: Array
     queries: Array | None
     active: Array | None
-    box: Box | None
-    cutoff: Cutoff | Radii  # cutoff of the list: a single one that includes the skin, or per-particle ones that do not
-    batch: Batch | None = None
-    exclude: Exclusions | None = None
+    box: geometry.Box | None
+    cutoff: geometry.Cutoff | geometry.Radii  # of the list: a single one that includes the skin, or per-particle ones that do not
+    batch: geometry.Batch | None = None
+    exclude: geometry.Exclusions | None = None
 
 
 def hide_inactive(positions: Array, active: Array | None) -> Array:
@@ -219,7 +196,7 @@ def _have_system(inputs: Inputs) -> tuple[Array | None, Array | None]:
     if batch is None:
         return None, None
     if box is not None and box.per_system:
-        there, asking = (has_box(x, len(box.vectors)) for x in (batch.sources, batch.of_queries))
+        there, asking = (geometry.has_box(x, len(box.vectors)) for x in (batch.sources, batch.of_queries))
     elif batch.fit is not None:
         there, asking = batch.fit
     else:
@@ -240,29 +217,29 @@ def prepare_search(inputs: Inputs, options: Options) -> Search:
     given, queries, active, box, cutoff, batch, exclude = take_present(asked)
     sources, images = hide_inactive(given, active), options.images
     per_system = box is not None and box.per_system and batch is not None
-    batch = None if batch is None or per_system else rank_systems(batch)
-    checks = {} if exclude is None or exclude.valid is None else {Status.EXCLUDED_OUT_OF_RANGE: exclude.valid}
+    batch = None if batch is None or per_system else geometry.rank_systems(batch)
+    checks = {} if exclude is None or exclude.valid is None else {geometry.Status.EXCLUDED_OUT_OF_RANGE: exclude.valid}
     checks |= {} if asked.batch is None else _check_systems(asked, asked.batch)
-    if isinstance(cutoff, Radii):
+    if isinstance(cutoff, geometry.Radii):
         asking = None if asked.queries is None else rows_asked(asked)[1]
-        sources, queries, checks[Status.INVALID_CUTOFF] = _with_valid_radii(sources, queries, active, asking, cutoff)
-        cutoff = make_cutoffs(cutoff, options.closed, options.skin)
+        sources, queries, checks[geometry.Status.INVALID_CUTOFF] = _with_valid_radii(sources, queries, active, asking, cutoff)
+        cutoff = geometry.make_cutoffs(cutoff, options.closed, options.skin)
     if per_system:
         return _prepare_boxes(asked, active, Search(sources, queries, cutoff, asked.batch, None, checks), options)
     if box is None or images is None:
-        excluded = None if exclude is None else exclude_in_space(exclude.rows)
+        excluded = None if exclude is None else geometry.exclude_in_space(exclude.rows)
         return Search(sources, queries, cutoff, batch, None, checks, excluded)
-    lattice = make_lattice(box, images, np.dtype(sources.dtype))
-    near = [bring_near(x, lattice) for x in (sources, queries) if x is not None]
+    lattice = geometry.make_lattice(box, images, np.dtype(sources.dtype))
+    near = [geometry.bring_near(x, lattice) for x in (sources, queries) if x is not None]
     sources, queries = near[0].points, None if queries is None else near[1].points
-    wrapped, moved = wrap(sources, queries, lattice, largest_radius(cutoff)), (near[0].turns, near[-1].turns)
-    excluded = None if exclude is None else exclude_in_lattice(exclude.rows, lattice, wrapped, moved, None)
-    checks[Status.BOX_TOO_SMALL] = wrapped.enough & is_valid(lattice)
-    checks[Status.OUT_OF_RANGE] = (wrapped.met & TOO_FAR) == 0
+    wrapped, moved = geometry.wrap(sources, queries, lattice, largest_radius(cutoff)), (near[0].turns, near[-1].turns)
+    excluded = None if exclude is None else geometry.exclude_in_lattice(exclude.rows, lattice, wrapped, moved, None)
+    checks[geometry.Status.BOX_TOO_SMALL] = wrapped.enough & geometry.is_valid(lattice)
+    checks[geometry.Status.OUT_OF_RANGE] = (wrapped.met & geometry.TOO_FAR) == 0
     return Search(sources, queries, cutoff, batch, (lattice, wrapped), checks, excluded)
 
 
-def _check_systems(asked: Inputs, batch: Batch) -> dict[Status, Array]:
+def _check_systems(asked: Inputs, batch: geometry.Batch) -> dict[geometry.Status, Array]:
     """Check that all particles that take part have a number of a system, where each system has a box of one there is, or -1."""
     box = asked.box
     if box is not None and box.per_system:
@@ -272,7 +249,7 @@ def _check_systems(asked: Inputs, batch: Batch) -> dict[Status, Array]:
     else:
         return {}
     named[0] = named[0] if asked.active is None else named[0] | ~asked.active
-    return {Status.SYSTEM_WITHOUT_BOX: functools.reduce(jnp.logical_and, (x.all() for x in named))}
+    return {geometry.Status.SYSTEM_WITHOUT_BOX: functools.reduce(jnp.logical_and, (x.all() for x in named))}
 
 
 def _prepare_boxes(asked: Inputs, present: Array | None, search: Search, options: Options) -> Search:
@@ -285,26 +262,26 @@ def _prepare_boxes(asked: Inputs, present: Array | None, search: Search, options
         raise TypeError("a search with a box per system needs boxes and a batch.")
     boxes = len(box.vectors)
     nearest = jax.tree.map(lambda x: jnp.clip(x, 0, boxes - 1), batch._replace(fit=None))
-    lattice = make_lattice(box, images, np.dtype(search.sources.dtype))
+    lattice = geometry.make_lattice(box, images, np.dtype(search.sources.dtype))
     clouds = zip((search.sources, search.queries), (nearest.sources, nearest.of_queries), strict=True)
-    near = [bring_near(x, lattice.of_rows(systems)) for x, systems in clouds if x is not None]
+    near = [geometry.bring_near(x, lattice.of_rows(systems)) for x, systems in clouds if x is not None]
     sources, queries, moved = near[0].points, None if search.queries is None else near[1].points, (near[0].turns, near[-1].turns)
-    wrapped = wrap(sources, queries, lattice, _radius_of_systems(search, nearest, boxes), nearest)
-    right = (wrapped.enough & is_valid(lattice))[nearest.sources]
+    wrapped = geometry.wrap(sources, queries, lattice, _radius_of_systems(search, nearest, boxes), nearest)
+    right = (wrapped.enough & geometry.is_valid(lattice))[nearest.sources]
     checks = {
-        Status.BOX_TOO_SMALL: (right | ~present).all(),
-        Status.OUT_OF_RANGE: (wrapped.met & TOO_FAR) == 0,
+        geometry.Status.BOX_TOO_SMALL: (right | ~present).all(),
+        geometry.Status.OUT_OF_RANGE: (wrapped.met & geometry.TOO_FAR) == 0,
     } | search.checks
     excluded = None
     if asked.exclude is not None:
-        excluded = exclude_in_lattice(asked.exclude.rows, lattice, wrapped, moved, nearest.of_queries)
+        excluded = geometry.exclude_in_lattice(asked.exclude.rows, lattice, wrapped, moved, nearest.of_queries)
     found = {"sources": sources, "queries": queries, "batch": nearest, "torus": (lattice, wrapped), "checks": checks}
     return search._replace(**found, exclude=excluded)
 
 
-def _radius_of_systems(search: Search, batch: Batch, boxes: int) -> np.floating | Array:
+def _radius_of_systems(search: Search, batch: geometry.Batch, boxes: int) -> np.floating | Array:
     """Return an upper bound on the cutoff of any pair, or on that of each system [systems, 1, 1], where cutoffs differ."""
-    if isinstance(search.cutoff, Cutoff):
+    if isinstance(search.cutoff, geometry.Cutoff):
         return search.cutoff.radius
     rule, found = search.cutoff.rule, []
     for of_points, systems, points in (
@@ -324,20 +301,20 @@ def find_bits(inputs: Inputs, options: Options) -> Array:
     return bits_of(prepare_search(inputs, options).checks)
 
 
-def bits_of(checks: dict[Status, Array]) -> Array:
+def bits_of(checks: dict[geometry.Status, Array]) -> Array:
     """Return the bits of what is not right, [] int32."""
     bits = (jnp.where(right, 0, bit.value).astype(jnp.int32) for bit, right in checks.items())
     return functools.reduce(jnp.bitwise_or, bits, jnp.int32(0))
 
 
 def _with_valid_radii(
-    sources: Array, queries: Array | None, active: Array | None, asking: Array | None, radii: Radii
+    sources: Array, queries: Array | None, active: Array | None, asking: Array | None, radii: geometry.Radii
 ) -> tuple[Array, Array | None, Array]:
     """Return positions and queries, moved to infinity if their cutoff is invalid, and whether all active ones have valid ones.
 
     `asking` says which queries take part; None: all.
     """
-    of_sources, of_queries = are_valid(radii)
+    of_sources, of_queries = geometry.are_valid(radii)
     right = [jnp.ones((), bool)]
     if queries is None:
         valid = next(x for x in (of_sources, of_queries) if x is not None)
@@ -355,6 +332,6 @@ def _where_rows(valid: Array, points: Array) -> Array:
     return jnp.where(valid[:, None], points, jnp.inf)
 
 
-def largest_radius(cutoff: Cutoff | Cutoffs) -> np.floating | Array:
+def largest_radius(cutoff: geometry.Cutoff | geometry.Cutoffs) -> np.floating | Array:
     """Return an upper bound on the cutoff of any pair."""
-    return cutoff.largest if isinstance(cutoff, Cutoffs) else cutoff.radius
+    return cutoff.largest if isinstance(cutoff, geometry.Cutoffs) else cutoff.radius

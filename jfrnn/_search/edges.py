@@ -8,20 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
+from jfrnn import _geometry as geometry
 from jfrnn._engine import flatten_slots
-from jfrnn._geometry import (
-    Lattice,
-    Radii,
-    Shifted,
-    Status,
-    are_finite,
-    are_whole,
-    forward_shifts,
-    is_pair_of,
-    mark_rows,
-    shift_pairs,
-    translation,
-)
 from jfrnn._search.exports import flat_pairs, row_offsets
 from jfrnn._search.geometry import edge_shifts, ends_of, lattice_of_rows, norms
 from jfrnn._search.present import Present, Reverse, Topology
@@ -69,7 +57,7 @@ class Edges(NamedTuple):
 
         Cost: 9 B per triplet, one pass. Jit: yes, with `total`; if `triplet_count` exceeds it, triplets are missing.
         """
-        known = are_whole(self.status) & (self.pair_count <= len(self.senders))
+        known = geometry.are_whole(self.status) & (self.pair_count <= len(self.senders))
         return triplets_of(self.receivers, self.mask, known, total, half)
 
 
@@ -173,17 +161,17 @@ def flat_edges(present: Present, status: Array, mask: Array, shifts: Array | Non
     if near is not None and shifts is not None:
         whole = jnp.where(real[:, None], shifts.reshape(-1, dim)[flat.slots], 0)
         lattice = _lattice_of_edges(present, flat.rows)
-        displacement = displacement + translation(whole, lattice)
+        displacement = displacement + geometry.translation(whole, lattice)
         shift = near._replace(of_rows=lattice).shifts_of_given(whole, senders, flat.rows)
         shift = jnp.where(real[:, None], shift, 0)
     displacement = jnp.where(real[:, None], displacement, 0).astype(sources.dtype)
-    missing, known = flat.offsets[-1] > total, are_whole(status)
-    displacement, shift, distance = (mark_rows(x, known & ~missing) for x in (displacement, shift, norms(displacement)))
-    status = status | jnp.where(missing, jnp.int32(Status.TOTAL_OVERFLOW.value), 0)
+    missing, known = flat.offsets[-1] > total, geometry.are_whole(status)
+    displacement, shift, distance = (geometry.mark_rows(x, known & ~missing) for x in (displacement, shift, norms(displacement)))
+    status = status | jnp.where(missing, jnp.int32(geometry.Status.TOTAL_OVERFLOW.value), 0)
     return Edges(senders, flat.rows, displacement, shift, real, status, distance, flat.offsets[-1])
 
 
-def _lattice_of_edges(present: Present, receivers: Array) -> Lattice:
+def _lattice_of_edges(present: Present, receivers: Array) -> geometry.Lattice:
     """Return the lattice of a box, or that of each edge."""
     if present.box is None or present.kind is None:
         raise TypeError("a list in open space has no lattice.")
@@ -213,9 +201,9 @@ def edges_of(present: Present, by_receiver: Topology, status: Array) -> Edges:
     vectors, mask, _, shift = _edge_pairs(present, by_receiver)
     missing, shift = present.count > len(mask), jnp.where(mask[:, None], shift, 0)
     displacement = jnp.where(mask[:, None], vectors[:, 0], 0).astype(present.sources.dtype)
-    known = are_whole(status, Status.NONFINITE) & ~missing
-    displacement, shift, distance = (mark_rows(x, known) for x in (displacement, shift, norms(displacement)))
-    status = status | jnp.where(missing, jnp.int32(Status.TOTAL_OVERFLOW.value), 0)
+    known = geometry.are_whole(status, geometry.Status.NONFINITE) & ~missing
+    displacement, shift, distance = (geometry.mark_rows(x, known) for x in (displacement, shift, norms(displacement)))
+    status = status | jnp.where(missing, jnp.int32(geometry.Status.TOTAL_OVERFLOW.value), 0)
     held = present.count if present.cutoff is None else jnp.where(missing, present.count, jnp.sum(mask, dtype=jnp.int32))
     return Edges(present.topology.idx[:, 0], by_receiver.idx[:, 0], displacement, shift, mask, status, distance, held)
 
@@ -242,9 +230,9 @@ def _edge_pairs(present: Present, by_receiver: Topology) -> _EdgePairs:
         lattice = _lattice_of_edges(present, receivers)
         whole = edge_shifts(vectors, mask, present, receivers, near, lattice)
         if present.forward:  # as in padded lists
-            whole = jnp.where((senders == receivers)[:, None, None], forward_shifts(whole, lattice), whole)
+            whole = jnp.where((senders == receivers)[:, None, None], geometry.forward_shifts(whole, lattice), whole)
         whole = jnp.where(mask[:, None, None], whole, 0)
-        pairs = shift_pairs(vectors, whole, lattice)
+        pairs = geometry.shift_pairs(vectors, whole, lattice)
         vectors, shift = pairs.vectors, near._replace(of_rows=lattice).shifts_of_given(whole[:, 0], senders, receivers)
     if present.cutoff is not None:
         mask = mask & _are_close(present, by_receiver, mask, sources, at_receivers, pairs)
@@ -252,28 +240,28 @@ def _edge_pairs(present: Present, by_receiver: Topology) -> _EdgePairs:
 
 
 def _are_close(
-    present: Present, by_receiver: Topology, real: Array, sources: Array, at_receivers: Array, pairs: Shifted | None
+    present: Present, by_receiver: Topology, real: Array, sources: Array, at_receivers: Array, pairs: geometry.Shifted | None
 ) -> Array:
     """Say which edges are those of pairs that are closer than the cutoff, exactly, [total] bool."""
     given, by_sender = present.cutoff, present.topology
-    if isinstance(given, Radii) and given.queries is not None:
+    if isinstance(given, geometry.Radii) and given.queries is not None:
         given = dataclasses.replace(given, queries=given.queries.at[by_receiver.idx[:, 0]].get(mode="clip"))
     senders, itself = jnp.where(real[:, None], by_sender.idx, 0), None
     fixed = lax.stop_gradient((at_receivers[:, 0], sources))
     pairs = None if pairs is None else pairs._replace(vectors=lax.stop_gradient(pairs.vectors))
-    if isinstance(given, Radii) and given.itself:  # rows are edges here
-        there = real & (by_sender.idx == by_receiver.idx)[:, 0] & are_finite(fixed[0])
+    if isinstance(given, geometry.Radii) and given.itself:  # rows are edges here
+        there = real & (by_sender.idx == by_receiver.idx)[:, 0] & geometry.are_finite(fixed[0])
         itself = there if pairs is None else there & (pairs.shifts == 0).all(axis=(1, 2))
         given = dataclasses.replace(given, itself=False)
     cutoffs = dataclasses.replace(present, cutoff=given).cutoffs
-    close = call_apart(is_pair_of, *fixed, senders, real[:, None], cutoffs, pairs)[:, 0]
+    close = call_apart(geometry.is_pair_of, *fixed, senders, real[:, None], cutoffs, pairs)[:, 0]
     return close if itself is None else close | itself
 
 
 def no_edges(mask: Array, sources: int, points: Array, status: Array, total: int) -> Edges:
     """Return the edges of a list that holds none, or of which none is asked for."""
     count = jnp.sum(mask, dtype=jnp.int32)
-    status = status | jnp.where(count > total, jnp.int32(Status.TOTAL_OVERFLOW.value), 0)
+    status = status | jnp.where(count > total, jnp.int32(geometry.Status.TOTAL_OVERFLOW.value), 0)
     displacement = jnp.zeros((total, points.shape[1]), points.dtype)
     ends = jnp.full(total, sources, jnp.int32), jnp.full(total, len(mask), jnp.int32)
     shift, none = displacement.astype(jnp.int32), jnp.zeros(total, bool)

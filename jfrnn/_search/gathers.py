@@ -16,19 +16,9 @@ from jax.core import ShapedArray
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
+from jfrnn import _tracing as tracing
 from jfrnn._engine import collect_slots
 from jfrnn._search.present import MOST_SLOTS, Topology
-from jfrnn._tracing import (
-    Aval,
-    Internal,
-    Tree,
-    compile_program,
-    on_platform,
-    result_aval,
-    unvarying_types,
-    vary,
-    varying_axes,
-)
 
 Structure = Any  # a `PyTreeDef`, which type checkers do not accept as a type
 _WIDEST = 16  # numbers of a slot that kernels add
@@ -47,11 +37,11 @@ def collect(y: Array, topology: Topology) -> Array:
     return bind(_collect_p, y, topology)
 
 
-def bind(primitive: Primitive, x: Array, given: Tree) -> Array:
+def bind(primitive: Primitive, x: Array, given: tracing.Tree) -> Array:
     """Apply a primitive of `define` to x and a pytree of arrays."""
     leaves, structure = jax.tree.flatten(given)
-    axes = varying_axes((x, leaves))
-    x, leaves = vary((x, leaves), axes)
+    axes = tracing.varying_axes((x, leaves))
+    x, leaves = tracing.vary((x, leaves), axes)
     return primitive.bind(x, *leaves, structure=structure)
 
 
@@ -67,7 +57,7 @@ def _collect(y: Array, topology: Topology) -> Array:
     if topology.native and flat.dtype in (np.float32, np.float64) and 0 < flat[0].size <= _WIDEST:
         given = flat.reshape(len(flat), -1), reverse.slots, reverse.starts, reverse.lengths
         on_cpu, on_cuda = (functools.partial(collect_slots, sources=topology.sources, cuda=cuda) for cuda in (False, True))
-        sums = on_platform(*given, cpu=on_cpu, cuda=on_cuda)
+        sums = tracing.on_platform(*given, cpu=on_cpu, cuda=on_cuda)
         return sums.reshape(topology.sources, *y.shape[2:])
     if reverse.starts is None or reverse.lengths is None:
         return jnp.sum(flat.at[reverse.slots].get(mode="fill", fill_value=0), axis=1)
@@ -107,8 +97,8 @@ def define(
     def run_plain(x: Array, *leaves: Array, structure: Structure) -> Array:
         return (plain or work)(x, jax.tree.unflatten(structure, leaves))
 
-    def shape(x: Aval, *leaves: Aval, structure: Structure) -> ShapedArray:
-        return result_aval(shape_of(x.shape, jax.tree.unflatten(structure, leaves)), x.dtype, (x, *leaves))
+    def shape(x: tracing.Aval, *leaves: tracing.Aval, structure: Structure) -> ShapedArray:
+        return tracing.result_aval(shape_of(x.shape, jax.tree.unflatten(structure, leaves)), x.dtype, (x, *leaves))
 
     def jvp(primals: tuple, tangents: tuple, *, structure: Structure) -> tuple[Array, Any]:
         result = primitive.bind(*primals, structure=structure)
@@ -128,7 +118,7 @@ def define(
             return result, ad.Zero(jax.typeof(result).to_tangent_aval())
         return result, functools.reduce(jnp.add, parts)
 
-    def transpose(cotangent: Internal, x: Internal, *leaves: Array, structure: Structure) -> list:
+    def transpose(cotangent: tracing.Internal, x: tracing.Internal, *leaves: Array, structure: Structure) -> list:
         none = [None] * len(leaves)
         if isinstance(cotangent, ad.Zero):
             return [ad.Zero(x.aval), *none]
@@ -151,10 +141,12 @@ def define(
         result = bind(primitive, x.reshape(-1, *x.shape[2:]), merged)
         return result.reshape(size, -1, *result.shape[1:]), 0
 
-    def lower(ctx: Internal, *args: Internal, **params: Internal) -> Internal:
-        return mlir.lower_fun(run, multiple_results=False)(ctx.replace(avals_in=unvarying_types(ctx.avals_in)), *args, **params)
+    def lower(ctx: tracing.Internal, *args: tracing.Internal, **params: tracing.Internal) -> tracing.Internal:
+        return mlir.lower_fun(run, multiple_results=False)(
+            ctx.replace(avals_in=tracing.unvarying_types(ctx.avals_in)), *args, **params
+        )
 
-    compiled = functools.partial(compile_program, static_argnames="structure")(run)
+    compiled = functools.partial(tracing.compile_program, static_argnames="structure")(run)
     primitive.def_impl(lambda *args, structure: compiled(*args, structure=structure))
     primitive.def_abstract_eval(shape)
     ad.primitive_jvps[primitive] = jvp

@@ -12,37 +12,12 @@ import numpy as np
 from jax import Array, lax
 from jax.core import Tracer
 
+from jfrnn import _geometry as geometry
 from jfrnn._engine import Inputs, Options, hide_inactive, take_present
-from jfrnn._geometry import (
-    ROWS_ARE_WHOLE,
-    Batch,
-    Box,
-    Exclusions,
-    Images,
-    NeighborOverflowError,
-    Radii,
-    Status,
-    are_whole,
-    box_of_list,
-    check_active,
-    check_again,
-    check_box,
-    check_devices,
-    check_radii,
-    check_slack,
-    check_table,
-    grow_images,
-    known_status,
-    make_cutoff,
-    mark_rows,
-    refuse_status,
-    round_box,
-)
 from jfrnn._search.culprits import name_culprits
 from jfrnn._search.geometry import real_points
-from jfrnn._search.making import find_fields
 from jfrnn._search.present import ImageCodes, Present, Reverse, Topology
-from jfrnn._search.problem import KeptOptions, Problem
+from jfrnn._search.problem import KeptOptions, Problem, find_fields
 from jfrnn._search.verlet import Verlet, has_moved_too_far
 from jfrnn._tracing import Flags, Given, Numbers, Points, Real, call_apart, compile_program, on_platform, own_transfers
 
@@ -56,15 +31,15 @@ class KeptSearch(KeptOptions):
     status: Array
     required: Array
     verlet: Verlet | None
-    box: Box | None
+    box: geometry.Box | None
     images: ImageCodes | None
-    radii: Radii | None
-    batch: Batch | None
-    exclude: Exclusions | None
+    radii: geometry.Radii | None
+    batch: geometry.Batch | None
+    exclude: geometry.Exclusions | None
     reverse: Reverse | None
     problem: Problem = dataclasses.field(metadata={"static": True})
-    _full = Status.ROW_OVERFLOW  # the bit that says that there is too little room
-    _harmless = ROWS_ARE_WHOLE  # bits that do not mean missing pairs
+    _full = geometry.Status.ROW_OVERFLOW  # the bit that says that there is too little room
+    _harmless = geometry.ROWS_ARE_WHOLE  # bits that do not mean missing pairs
     _room_name = "capacity"
     _round_room: ClassVar[Callable[[int], int]]  # rounds the room that is needed up, so that similar scenes share a program
     _count_room: ClassVar[Callable[[Inputs, Options, float], int]]  # the room that a search at concrete positions takes, with slack
@@ -102,30 +77,32 @@ class KeptSearch(KeptOptions):
         """Return how many pairs a padded list holds."""
         raise NotImplementedError
 
-    def _check_known(self, spared: Status = Status.OK) -> None:
+    def _check_known(self, spared: geometry.Status = geometry.Status.OK) -> None:
         """Raise what status bits report, except the spared ones; a traced list is not checked.
 
         A list with a skin names particles, where it was rebuilt.
         """
-        status = (known_status(self.status) or Status.OK) & ~spared
+        status = (geometry.known_status(self.status) or geometry.Status.OK) & ~spared
         if not status:
             return
         if self._full in status:
-            raise NeighborOverflowError(int(np.max(jax.device_get(self.required))), self._room, self._room_name)
-        if Status.TOTAL_OVERFLOW in status:
+            raise geometry.NeighborOverflowError(int(np.max(jax.device_get(self.required))), self._room, self._room_name)
+        if geometry.Status.TOTAL_OVERFLOW in status:
             raise ValueError(f"{status.message} At present it holds {self._pairs_held()}.")
         verlet, problem, more = self.verlet, self.problem, ""
         if verlet is not None and verlet.positions.ndim == 2:
             kept = (verlet.positions, verlet.queries, None, verlet.box, verlet.radii or self.radii, self.batch, self.exclude)
-            more = name_culprits(status & ~(Status.NONFINITE if self.masked else Status.OK), problem.inputs(*kept))
-        refuse_status(status, self.box, self.box_kind, problem.reach(self.radii), more)
+            more = name_culprits(
+                status & ~(geometry.Status.NONFINITE if self.masked else geometry.Status.OK), problem.inputs(*kept)
+            )
+        geometry.refuse_status(status, self.box, self.box_kind, problem.reach(self.radii), more)
 
     def _mark(self, x: Array) -> Array:
         """Return what was computed of the pairs; where the list is traced, NaN or the smallest integer if pairs may be missing.
 
         Outside jit, `_check_known` has raised then.
         """
-        return mark_rows(x, are_whole(self.status, self._harmless)) if isinstance(self.status, Tracer) else x
+        return geometry.mark_rows(x, geometry.are_whole(self.status, self._harmless)) if isinstance(self.status, Tracer) else x
 
     def _describe(self, batch: Sequence[int], rows: int | None, room: str, found: str) -> str:
         """Summarize the list in a line: of how many rows, with how much room, and what it has found."""
@@ -140,7 +117,7 @@ class KeptSearch(KeptOptions):
     def overflow(self) -> Array:
         """Whether pairs may be missing for lack of room, or because a box needs more images, [] bool; `grow` fixes both."""
         with own_transfers():
-            return (self.status & (self._full | Status.BOX_TOO_SMALL).value) != 0
+            return (self.status & (self._full | geometry.Status.BOX_TOO_SMALL).value) != 0
 
     @property
     def rebuild_count(self) -> Array:
@@ -166,7 +143,7 @@ class KeptSearch(KeptOptions):
     def update(
         self,
         positions: Points,
-        box: Box | None = None,
+        box: geometry.Box | None = None,
         *,
         cutoff: Numbers | Points | tuple[Numbers, Numbers] | None = None,
         queries: Points | None = None,
@@ -207,7 +184,7 @@ class KeptSearch(KeptOptions):
     def grow(
         self,
         positions: Points,
-        box: Box | None = None,
+        box: geometry.Box | None = None,
         *,
         cutoff: Numbers | Points | tuple[Numbers, Numbers] | None = None,
         queries: Points | None = None,
@@ -237,7 +214,7 @@ class KeptSearch(KeptOptions):
         """
         sources, rows, box = self._geometry_inputs(positions, queries, box)
         rows = rows if self.own_queries else None
-        radii, slack = self._radii_now(cutoff, sources, rows), check_slack(slack)
+        radii, slack = self._radii_now(cutoff, sources, rows), geometry.check_slack(slack)
         active = self._check_active(active, sources)
         if any(isinstance(x, Tracer) for x in jax.tree.leaves((sources, rows, active, box, radii, self.required))):
             raise TypeError("grow() changes the shape of the list and cannot run inside jax.jit: call it on what jit returns.")
@@ -245,7 +222,7 @@ class KeptSearch(KeptOptions):
         options = self.problem.options._replace(images=images)
         wider = _replace(self, problem=dataclasses.replace(self.problem, options=options))
         if box is not None and images is not None:
-            box = box_of_list(box, images, self.problem.reach(radii))
+            box = geometry.box_of_list(box, images, self.problem.reach(radii))
         inputs = self.problem.inputs(sources, rows, active, box, radii, self.batch, self.exclude)
         with own_transfers():
             met = self._round_room(math.ceil(slack * int(np.max(np.asarray(self.required)))))
@@ -257,44 +234,44 @@ class KeptSearch(KeptOptions):
         if self.masked != (active is not None):
             state = "with active: pass active=" if self.masked else "without active: leave active out"
             raise ValueError(f"this list was made {state}.")
-        return None if active is None else check_active(active, sources)
+        return None if active is None else geometry.check_active(active, sources)
 
-    def _radii_now(self, cutoff: Given, sources: Array, queries: Array | None) -> Radii | None:
+    def _radii_now(self, cutoff: Given, sources: Array, queries: Array | None) -> geometry.Radii | None:
         if cutoff is None:
             return self.radii
         if self.radii is None:
             raise ValueError("this list was made with one cutoff for all particles: leave cutoff out.")
         if self.radii.table is not None:
-            return dataclasses.replace(self.radii, table=check_table(cutoff, sources, self.radii.table.shape[0]))
-        radii = check_radii(cutoff, self.radii.asked, sources, queries)
+            return dataclasses.replace(self.radii, table=geometry.check_table(cutoff, sources, self.radii.table.shape[0]))
+        radii = geometry.check_radii(cutoff, self.radii.asked, sources, queries)
         if radii is None:
             raise ValueError("this list was made with a cutoff for each particle: pass such an array, or leave cutoff out.")
         return dataclasses.replace(radii, itself=self.radii.itself)
 
-    def _box_now(self, box: Box | None, sources: Array) -> Box | None:
+    def _box_now(self, box: geometry.Box | None, sources: Array) -> geometry.Box | None:
         if box is None:
             return self.box
         if self.box is None:
             raise ValueError("this list was made without a periodic box: leave box out.")
-        checked = check_box(box, sources, like=self.box)
+        checked = geometry.check_box(box, sources, like=self.box)
         if checked is None:
             return None
-        return round_box(checked.counted_as(self.box).of_list(self.box.images_of_list), np.dtype(sources.dtype))
+        return geometry.round_box(checked.counted_as(self.box).of_list(self.box.images_of_list), np.dtype(sources.dtype))
 
-    def _grow_images(self, box: Box | None, radii: Radii | None) -> Images | None:
+    def _grow_images(self, box: geometry.Box | None, radii: geometry.Radii | None) -> geometry.Images | None:
         if self.box_kind is None or self.box is None or box is None:
             return self.box_kind
-        short = bool(np.any(np.asarray(jax.device_get(self.status)) & Status.BOX_TOO_SMALL.value))
+        short = bool(np.any(np.asarray(jax.device_get(self.status)) & geometry.Status.BOX_TOO_SMALL.value))
         reach = self.problem.reach(radii)
-        return grow_images(self.box_kind, (box, self.box), reach, self.dtype, self.source_count, short)
+        return geometry.grow_images(self.box_kind, (box, self.box), reach, self.dtype, self.source_count, short)
 
     def _present(
-        self, topology: Topology, count: Array, sources: Array, rows: Array, box: Box | None, decided: bool = False
+        self, topology: Topology, count: Array, sources: Array, rows: Array, box: geometry.Box | None, decided: bool = False
     ) -> Present:
         """Return the list at positions that are lengths, in the present box; `decided`: all of its pairs are pairs now."""
         problem, images, closed, cutoff = self.problem, self.images, self.problem.options.closed, None
         if not decided:
-            cutoff = self.radii if problem.cutoff is None else make_cutoff(problem.cutoff, problem.dtype, closed)
+            cutoff = self.radii if problem.cutoff is None else geometry.make_cutoff(problem.cutoff, problem.dtype, closed)
         kind, batch, forward = None, None, False
         if box is not None:
             kind, batch = problem.options.images, self.batch
@@ -302,17 +279,19 @@ class KeptSearch(KeptOptions):
         made = None if images is None or self.verlet is None else (self.verlet.positions, self.verlet.queries)
         return Present(topology, count, (images, made), sources, rows, box, batch, cutoff, kind, closed, forward)
 
-    def _geometry_inputs(self, positions: Points, queries: Points | None, box: Box | None) -> tuple[Array, Array, Box | None]:
+    def _geometry_inputs(
+        self, positions: Points, queries: Points | None, box: geometry.Box | None
+    ) -> tuple[Array, Array, geometry.Box | None]:
         """Return the present positions of sources and rows, as lengths, and the present box, after checking that they fit."""
         problem, rows = self.problem, None
-        sources = check_again("positions", positions, problem.dtype, problem.dim, problem.source_count)
-        check_devices("positions", sources, self.status)
+        sources = geometry.check_again("positions", positions, problem.dtype, problem.dim, problem.source_count)
+        geometry.check_devices("positions", sources, self.status)
         if problem.own_queries != (queries is not None):
             state = "with queries: pass queries=" if problem.own_queries else "without queries: leave queries out"
             raise ValueError(f"this list was made {state}.")
         if queries is not None:
-            rows = check_again("queries", queries, problem.dtype, problem.dim, self._row_count)
-            check_devices("queries", rows, self.status)
+            rows = geometry.check_again("queries", queries, problem.dtype, problem.dim, self._row_count)
+            geometry.check_devices("queries", rows, self.status)
         box = self._box_now(box, sources)
         if box is not None and box.fractional:
             sources, rows = real_points(sources, rows, box, self.batch, problem.options.engine.native)
@@ -324,7 +303,9 @@ def _replace(nbrs: Kept, **fields: object) -> Kept:
 
 
 @compile_program
-def _update(nbrs: Kept, sources: Array, queries: Array | None, active: Array | None, box: Box | None, radii: Radii | None) -> Kept:
+def _update(
+    nbrs: Kept, sources: Array, queries: Array | None, active: Array | None, box: geometry.Box | None, radii: geometry.Radii | None
+) -> Kept:
     """Make a list anew if it is stale; without a box, in its own."""
     stays, box = box is None, nbrs.box if box is None else box
     sources, queries, box, radii = lax.stop_gradient((sources, queries, box, radii))
@@ -347,7 +328,7 @@ def _make_again_if_stale(nbrs: Kept, inputs: Inputs) -> Kept:
     """Let XLA decide: the host learns whether the list is stale."""
     assert nbrs.verlet is not None
     sources, queries, _, box = inputs[:4]
-    radii = inputs.cutoff if isinstance(inputs.cutoff, Radii) else None
+    radii = inputs.cutoff if isinstance(inputs.cutoff, geometry.Radii) else None
     now = hide_inactive(sources, take_present(inputs).active)
     moved = has_moved_too_far(nbrs.verlet, now, queries, box, nbrs.box_kind, radii, nbrs.skin, nbrs.batch)
     fixed = {"box": box, "radii": radii, "batch": nbrs.batch, "exclude": nbrs.exclude}

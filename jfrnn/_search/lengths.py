@@ -6,7 +6,7 @@ of its reverse slot. Neither displacements nor what belongs to them is stored.
 
 import dataclasses
 import functools
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -21,13 +21,7 @@ from jfrnn._search.geometry import kept_list, kept_shifts, norms, vectors_of
 from jfrnn._search.present import Present, Topology
 from jfrnn._tracing import call_apart, compile_program
 
-
-class _Lines(NamedTuple):
-    """The pairs of a list at present positions, and their distances, 0 where there is no pair."""
-
-    kept: KeptList
-    topology: Topology
-    distances: Array
+_Lines = tuple[KeptList, Topology, Array]  # a list at present positions, and its distances, 0 where there is no pair
 
 
 @compile_program
@@ -45,11 +39,6 @@ def _at(sources: Array, box: Box | None, fixed: Present) -> Present:
     return dataclasses.replace(fixed, sources=sources, rows=sources, box=box)
 
 
-def _by_vectors(present: Present) -> tuple[Array, Array]:
-    vectors, mask, _ = vectors_of(present)
-    return norms(vectors), mask
-
-
 @functools.partial(_lengths.defjvp, symbolic_zeros=True)
 def _lengths_jvp(primals: tuple, tangents: tuple) -> tuple[Any, Any]:
     sources, box, present = primals
@@ -57,7 +46,12 @@ def _lengths_jvp(primals: tuple, tangents: tuple) -> tuple[Any, Any]:
     if any(not isinstance(x, SymbolicZero) for x in jax.tree.leaves(stretched)):
         both = (moved, stretched), (sources, box)
         moved, stretched = jax.tree.map(lambda x, at: jnp.zeros_like(at) if isinstance(x, SymbolicZero) else x, *both)
-        (_, mask), (slopes, none) = jax.jvp(lambda x, box: _by_vectors(_at(x, box, present)), (sources, box), (moved, stretched))
+
+        def by_vectors(sources: Array, box: Box | None) -> tuple[Array, Array]:
+            vectors, mask, _ = vectors_of(_at(sources, box, present))
+            return norms(vectors), mask
+
+        (_, mask), (slopes, none) = jax.jvp(by_vectors, (sources, box), (moved, stretched))
         return (_lengths(*primals)[0], mask), (slopes, none)
     distances, mask = _lengths(*primals)
     none = SymbolicZero(jax.typeof(mask).to_tangent_aval())
@@ -65,36 +59,37 @@ def _lengths_jvp(primals: tuple, tangents: tuple) -> tuple[Any, Any]:
         return (distances, mask), (SymbolicZero(jax.typeof(distances)), none)
     fixed = kept_list(_at(sources, box, present))
     near = sources if fixed.lattice is None else bring_near(sources, fixed.lattice).points
-    lines = _Lines(fixed._replace(sources=near, rows=near), present.topology, distances)
+    lines = fixed._replace(sources=near, rows=near), present.topology, distances
     return (distances, mask), (bind(_along_p, moved, lines), none)
 
 
 def _directions(lines: _Lines) -> Array:
     """Return unit vectors from i to j, [n, capacity, d], 0 where there is no distance."""
-    kept = lines.kept
-    vectors = gather(kept.sources, lines.topology) - kept.sources[:, None, :]
+    kept, topology, distances = lines
+    vectors = gather(kept.sources, topology) - kept.sources[:, None, :]
     if kept.lattice is not None:
         vectors = vectors + translation(lax.stop_gradient(kept_shifts(kept)), kept.lattice)
-    apart = lines.distances > 0
-    return jnp.where(apart[..., None], vectors / jnp.where(apart, lines.distances, 1)[..., None], 0)
+    apart = distances > 0
+    return jnp.where(apart[..., None], vectors / jnp.where(apart, distances, 1)[..., None], 0)
 
 
 def _along(moved: Array, lines: _Lines) -> Array:
     """Return how fast distances grow while sources move, [n, capacity]."""
-    away = gather(moved, lines.topology) - moved[:, None, :]
+    away = gather(moved, lines[1]) - moved[:, None, :]
     return jnp.sum(_directions(lines) * away, axis=-1)
 
 
 def _pull(slopes: Array, lines: _Lines) -> Array:
     """Return the transpose of `_along`, [n, d]."""
     parts = slopes[..., None] * _directions(lines)
-    return collect(parts, lines.topology) - jnp.sum(parts, axis=1)
+    return collect(parts, lines[1]) - jnp.sum(parts, axis=1)
 
 
 def _pull_by_kernel(slopes: Array, lines: _Lines) -> Array:
-    return kept_slopes(lines.kept, lines.topology.with_reverse().slots, lines.distances, slopes)
+    kept, topology, distances = lines
+    return kept_slopes(kept, topology.with_reverse().slots, distances, slopes)
 
 
 _along_p, _pull_p = Primitive("jfrnn_along"), Primitive("jfrnn_pull")
-define(_along_p, _along, _pull_p, lambda shape, lines: lines.distances.shape, _along)
-define(_pull_p, _pull_by_kernel, _along_p, lambda shape, lines: lines.kept.sources.shape, _pull)
+define(_along_p, _along, _pull_p, lambda _, lines: lines[2].shape, _along)
+define(_pull_p, _pull_by_kernel, _along_p, lambda _, lines: lines[0].sources.shape, _pull)

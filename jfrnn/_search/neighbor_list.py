@@ -22,8 +22,8 @@ from jfrnn._search.edges import Edges, Graph, flat_edges, make_graph, no_edges
 from jfrnn._search.exports import check_held, check_total, pair_total
 from jfrnn._search.geometry import lattice_shifts, norms, vectors_of
 from jfrnn._search.list_exports import ListExports
-from jfrnn._search.making import count_capacity, round_capacity
 from jfrnn._search.present import MOST_SLOTS, Present, Topology, make_topology
+from jfrnn._search.problem import count_capacity, round_capacity
 from jfrnn._tracing import Points, Size, own_transfers
 
 _FEW_SLOTS = 1 << 18  # up to which a program takes longer to compile than its displacements to compute

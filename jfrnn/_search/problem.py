@@ -1,44 +1,41 @@
-"""The problem: the arguments that all public functions share, checked, and the static part that a list keeps."""
+"""The problem: the arguments that all public functions share, checked, the static part that a list keeps, and its search."""
 
 import dataclasses
+import functools
 import math
 from fractions import Fraction
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jax import Array
+from jax import Array, lax
 from jax.core import Tracer
 
-from jfrnn._engine import ENGINES, Features, Filter, Inputs, Options, choose_engine, has_order, parse_backend, platform_of
-from jfrnn._geometry import (
-    EXCHANGED,
-    Batch,
-    Box,
-    Exclusions,
-    Images,
-    Radii,
-    Status,
-    box_of_list,
-    check_active,
-    check_batch,
-    check_box,
-    check_cutoff,
-    check_exclusions,
-    check_flag,
-    check_positions,
-    check_radii,
-    check_skin,
-    check_species,
-    images_of,
-    largest_known,
-    make_cutoff,
-    refuse_status,
-    round_box,
+from jfrnn import _geometry as geometry
+from jfrnn._engine import (
+    ENGINES,
+    Features,
+    Filter,
+    Inputs,
+    Options,
+    choose_engine,
+    count_few,
+    count_rows,
+    find_rows,
+    has_order,
+    hide_inactive,
+    list_flat,
+    parse_backend,
+    platform_of,
+    take_present,
 )
 from jfrnn._search.culprits import name_culprits
 from jfrnn._search.geometry import real_points
-from jfrnn._tracing import Given
+from jfrnn._search.present import ImageCodes, find_reverse, make_topology
+from jfrnn._search.verlet import first_verlet
+from jfrnn._tracing import Given, Real, at_once, compile_program, own_transfers
+
+_CAPACITY_STEP = 8
 
 
 def list_radius(cutoff: float, skin: float, dtype: np.dtype) -> float:
@@ -81,9 +78,9 @@ class Problem:
         """Whether each particle is its own neighbor."""
         return not self.own_queries and not self.options.filter.drop_self
 
-    def reach(self, radii: Radii | None) -> float | None:
+    def reach(self, radii: geometry.Radii | None) -> float | None:
         """Return the largest distance of listed pairs, skin included; None if it is not known while tracing."""
-        largest = self.cutoff if radii is None else largest_known(radii)
+        largest = self.cutoff if radii is None else geometry.largest_known(radii)
         return None if largest is None else list_radius(largest, self.skin, self.dtype)
 
     def inputs(
@@ -91,10 +88,10 @@ class Problem:
         sources: Array,
         queries: Array | None,
         active: Array | None,
-        box: Box | None,
-        radii: Radii | None,
-        batch: Batch | None,
-        exclude: Exclusions | None,
+        box: geometry.Box | None,
+        radii: geometry.Radii | None,
+        batch: geometry.Batch | None,
+        exclude: geometry.Exclusions | None,
     ) -> Inputs:
         """Return the operands of this search for these particles."""
         if radii is not None:
@@ -102,18 +99,18 @@ class Problem:
         if self.cutoff is None:
             raise TypeError("a search needs a cutoff or radii.")
         reach = list_radius(self.cutoff, self.skin, self.dtype)
-        return Inputs(sources, queries, active, box, make_cutoff(reach, self.dtype, self.options.closed), batch, exclude)
+        return Inputs(sources, queries, active, box, geometry.make_cutoff(reach, self.dtype, self.options.closed), batch, exclude)
 
-    def refuse(self, status: Status | None, inputs: Inputs) -> None:
+    def refuse(self, status: geometry.Status | None, inputs: Inputs) -> None:
         """Raise what bits report of a search of concrete particles, if any is set; None: they are not known.
 
         Raises:
             ValueError: a bit is set.
         """
         if status:
-            reach = self.reach(inputs.cutoff if isinstance(inputs.cutoff, Radii) else None)
+            reach = self.reach(inputs.cutoff if isinstance(inputs.cutoff, geometry.Radii) else None)
             known = not any(isinstance(x, Tracer) for x in jax.tree.leaves(inputs))
-            refuse_status(status, inputs.box, self.options.images, reach, name_culprits(status, inputs) if known else "")
+            geometry.refuse_status(status, inputs.box, self.options.images, reach, name_culprits(status, inputs) if known else "")
 
 
 class KeptOptions:
@@ -157,7 +154,7 @@ class KeptOptions:
         return self.problem.masked
 
     @property
-    def box_kind(self) -> Images | None:
+    def box_kind(self) -> geometry.Images | None:
         """The periodic axes and the images that the search considers; None in open space."""
         return self.problem.options.images
 
@@ -203,28 +200,38 @@ class Asked(NamedTuple):
 
 def check_problem(asked: Asked) -> tuple["Problem", Inputs]:
     """Check what is asked; return its static part and the operands."""
-    sources, queries = check_positions("positions", asked.positions), None
+    sources, queries = geometry.check_positions("positions", asked.positions), None
     if asked.queries is not None:
-        queries = check_positions("queries", asked.queries, like=sources)
+        queries = geometry.check_positions("queries", asked.queries, like=sources)
         for name, value in (("half", asked.half), ("include_self", asked.include_self)):
-            if check_flag(name, value):
+            if geometry.check_flag(name, value):
                 raise ValueError(f"{name}=True pairs particles with themselves or each other: it cannot be used with queries.")
-    active, dtype = None if asked.active is None else check_active(asked.active, sources), np.dtype(sources.dtype)
-    drop_self = queries is None and not check_flag("include_self", asked.include_self)
-    keep, closed = Filter(drop_self, later_only=check_flag("half", asked.half)), check_flag("closed", asked.closed)
-    radii = _check_cutoffs(asked, sources, queries, keep)
-    excluded = None if asked.exclude is None else check_exclusions(asked.exclude, sources, queries)
-    radius = check_cutoff(asked.cutoff, dtype) if radii is None else None
-    largest = radius if radii is None else largest_known(radii)
-    skin = check_skin(asked.skin, largest or 0.0, dtype)
+    active, dtype = None if asked.active is None else geometry.check_active(asked.active, sources), np.dtype(sources.dtype)
+    drop_self = queries is None and not geometry.check_flag("include_self", asked.include_self)
+    keep, closed = (
+        Filter(drop_self, later_only=geometry.check_flag("half", asked.half)),
+        geometry.check_flag("closed", asked.closed),
+    )
+    if asked.species is None:
+        radii = geometry.check_radii(asked.cutoff, asked.radius_rule, sources, queries)
+    else:
+        masked = asked.active is not None or (isinstance(asked.box, geometry.Box) and asked.box.per_system)
+        radii = geometry.check_species(asked.cutoff, asked.species, asked.radius_rule, sources, queries, masked)
+    if radii is not None and keep.later_only and radii.rule in geometry.EXCHANGED:
+        raise ValueError(f"half=True keeps pairs without direction, which radius_rule={radii.rule!r} gives: pass 'either'.")
+    radii = dataclasses.replace(radii, itself=True) if radii is not None and queries is None and not drop_self else radii
+    excluded = None if asked.exclude is None else geometry.check_exclusions(asked.exclude, sources, queries)
+    radius = geometry.check_cutoff(asked.cutoff, dtype) if radii is None else None
+    largest = radius if radii is None else geometry.largest_known(radii)
+    skin = geometry.check_skin(asked.skin, largest or 0.0, dtype)
     reach = None if largest is None else list_radius(largest, skin, dtype)
-    box = None if asked.box is None else check_box(asked.box, sources)
+    box = None if asked.box is None else geometry.check_box(asked.box, sources)
     if box is not None and box.per_system and asked.batch is None:
         raise ValueError("box holds a box per system: pass batch=, the system of each particle (from 0 on; -1: in none of them).")
-    images = None if box is None else images_of(box, reach, dtype, sources.shape[0])
+    images = None if box is None else geometry.images_of(box, reach, dtype, sources.shape[0])
     features = Features(box is not None, asked.batch is not None, radii is not None, excluding=asked.exclude is not None)
     engine = choose_engine(parse_backend(asked.backend, ENGINES), sources, queries, features)
-    systems = None if asked.batch is None else check_batch(asked.batch, sources, queries)
+    systems = None if asked.batch is None else geometry.check_batch(asked.batch, sources, queries)
     ordered = has_order(engine, platform_of(sources), sources.shape[0], queries is None and radii is None)
     static_reach = reach if engine.static_radius else None
     if box is not None and box.fractional:
@@ -232,18 +239,51 @@ def check_problem(asked: Asked) -> tuple["Problem", Inputs]:
     options = Options(keep, engine, closed, 0.0 if radii is None else skin, images, static_reach, ordered)
     shape = {"own_queries": queries is not None, "masked": active is not None, "source_count": sources.shape[0]}
     problem = Problem(options, radius, skin, **shape, dim=sources.shape[1], dtype=dtype)
-    box = None if box is None or images is None else box_of_list(round_box(box, dtype), images, reach)
+    box = None if box is None or images is None else geometry.box_of_list(geometry.round_box(box, dtype), images, reach)
     return problem, problem.inputs(sources, queries, active, box, radii, systems, excluded)
 
 
-def _check_cutoffs(asked: Asked, sources: Array, queries: Array | None, keep: Filter) -> Radii | None:
-    """Return cutoffs that differ, None with one for all."""
-    if asked.species is None:
-        radii = check_radii(asked.cutoff, asked.radius_rule, sources, queries)
-    else:
-        masked = asked.active is not None or (isinstance(asked.box, Box) and asked.box.per_system)
-        radii = check_species(asked.cutoff, asked.species, asked.radius_rule, sources, queries, masked)
-    if radii is not None and keep.later_only and radii.rule in EXCHANGED:
-        raise ValueError(f"half=True keeps pairs without direction, which radius_rule={radii.rule!r} gives: pass 'either'.")
-    own = queries is None and not keep.drop_self
-    return dataclasses.replace(radii, itself=True) if radii is not None and own else radii
+# --- its search -----------------------------------------------------------------------------------------------------------
+
+
+def round_capacity(slots: int) -> int:
+    """Round a capacity up, so that similar scenes share one compiled program."""
+    return -(-slots // _CAPACITY_STEP) * _CAPACITY_STEP
+
+
+def count_capacity(inputs: Inputs, options: Options, slack: Real) -> int:
+    """Count the neighbors of concrete positions; return a capacity of `slack` times the longest row."""
+    with at_once(), own_transfers():
+        known = count_few(inputs, options)
+        longest = int(count_rows(inputs, options=options)[1]) if known is None else int(known.max())
+    wanted = math.ceil(max(longest, 1) * slack)
+    return min(round_capacity(wanted), max(wanted, inputs.sources.shape[0]))
+
+
+@functools.partial(compile_program, static_argnames=("options", "room", "moving", "reversing", "flat"))
+def find_fields(inputs: Inputs, options: Options, room: int, moving: bool, reversing: bool, flat: bool) -> dict[str, Any]:
+    """Search, and return the list's fields that come from data: the compiled program of `search` and, if `flat`, `search_edges`.
+
+    `room` is the capacity or the total, `moving` says that the list has a skin, `reversing` that it keeps where pairs stand the
+    other way round. All are given by name: what JAX keeps of a call depends on it.
+
+    As results of one program, they share no memory with the caller's arrays or each other, so either may be donated.
+    """
+    offsets, found = list_flat(inputs, options, room) if flat else (None, find_rows(inputs, options, room))
+    rows, n, verlet, reverse = found.rows, len(inputs.sources), None, None
+    images = None if found.images is None or found.turns is None else ImageCodes(found.images, found.turns[0], found.turns[1])
+    radii = lax.stop_gradient(inputs.cutoff) if isinstance(inputs.cutoff, geometry.Radii) else None
+    if moving:
+        sources = hide_inactive(inputs.sources, take_present(inputs).active)
+        verlet = first_verlet(sources, inputs.queries, inputs.box, options.images, radii, inputs.batch)
+    if reversing and rows.idx is not None and flat:
+        reverse = find_reverse(rows.idx[:, None], None, 1, n, False, options.engine.native)
+    elif reversing and rows.idx is not None:
+        codes = None if images is None else images.codes
+        topology = make_topology(options, n, inputs.queries is not None, radii, rows.idx, codes, None, rows.order)
+        reverse = topology.with_reverse()
+    fields = {"status": rows.status, "required": rows.required, "verlet": verlet, "box": lax.stop_gradient(inputs.box)}
+    fields |= {"images": images, "radii": radii, "batch": inputs.batch, "exclude": inputs.exclude, "reverse": reverse}
+    if flat:
+        return fields | {"senders": rows.idx, "receivers": rows.receivers, "offsets": offsets}
+    return fields | {"idx": rows.idx, "count": rows.counts, "order": rows.order}

@@ -11,10 +11,9 @@ from jfrnn._engine import Inputs, count_rows, mark_counts
 from jfrnn._geometry import Box, check_capacity, check_flag, check_slack, known_status
 from jfrnn._search.edge_list import EdgeList, count_total
 from jfrnn._search.exports import check_total
-from jfrnn._search.making import count_capacity, find_fields
 from jfrnn._search.neighbor_list import NeighborList
 from jfrnn._search.present import MOST_SLOTS
-from jfrnn._search.problem import Asked, check_problem
+from jfrnn._search.problem import Asked, check_problem, count_capacity, find_fields
 from jfrnn._tracing import (
     AnyCutoff,
     Backend,

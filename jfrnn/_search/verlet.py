@@ -12,22 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from jfrnn._geometry import (
-    Batch,
-    Box,
-    Cutoff,
-    Images,
-    Lattice,
-    Radii,
-    box_change,
-    bring_near,
-    is_radius,
-    make_cutoff,
-    make_lattice,
-    motion_of,
-    squared_distance,
-    widen,
-)
+from jfrnn import _geometry as geometry
 from jfrnn._search.geometry import find_ends
 
 
@@ -47,8 +32,8 @@ class Verlet:
 
     positions: Array
     queries: Array | None
-    box: Box | None
-    radii: Radii | None
+    box: geometry.Box | None
+    radii: geometry.Radii | None
     rebuild_count: Array
 
 
@@ -56,11 +41,11 @@ def has_moved_too_far(
     verlet: Verlet,
     positions: Array,
     queries: Array | None,
-    box: Box | None,
-    box_kind: Images | None,
-    radii: Radii | None,
+    box: geometry.Box | None,
+    box_kind: geometry.Images | None,
+    radii: geometry.Radii | None,
     skin: float,
-    batch: Batch | None = None,
+    batch: geometry.Batch | None = None,
 ) -> Array:
     """Say whether any point is, or may be by rounding, skin/2 or more from where the list was made, [] bool.
 
@@ -69,23 +54,23 @@ def has_moved_too_far(
     pair against each other, and larger cutoffs reach farther; both reduce the skin that is left for motion. By any rule, a pair's
     cutoff grows by no more than the two cutoffs from which it is made.
     """
-    half = make_cutoff(skin / 2, np.dtype(positions.dtype), closed=False)
+    half = geometry.make_cutoff(skin / 2, np.dtype(positions.dtype), closed=False)
     used, grown, moved = jnp.zeros((), positions.dtype), jnp.zeros((), positions.dtype), jnp.zeros((), bool)
     clouds = [(verlet.positions, positions)]
     if queries is not None and verlet.queries is not None:
         clouds.append((verlet.queries, queries))
     old, news = None, [None] * len(clouds)
     if box is not None and verlet.box is not None and box_kind is not None:
-        old, new = (make_lattice(x, box_kind, np.dtype(positions.dtype)) for x in (verlet.box, box))
+        old, new = (geometry.make_lattice(x, box_kind, np.dtype(positions.dtype)) for x in (verlet.box, box))
         news = [new] * len(clouds)
         if box.per_system and batch is not None:
             news, old = [new.of_rows(x) for x in (batch.sources, batch.of_queries)], old.of_rows(batch.sources)
-        clouds = [(before, bring_near(now, each).points) for (before, now), each in zip(clouds, news, strict=False)]
+        clouds = [(before, geometry.bring_near(now, each).points) for (before, now), each in zip(clouds, news, strict=False)]
     found = (_find_extremes(*cloud, lattice, half) for cloud, lattice in zip(clouds, news, strict=False))
     extremes = functools.reduce(jnp.maximum, found)
     if old is not None and news[0] is not None:
         below, above = jnp.split(extremes[1:], 2)
-        used = box_change(old, news[0], jnp.where(below + above >= 0, below + above, 0))
+        used = geometry.box_change(old, news[0], jnp.where(below + above >= 0, below + above, 0))
     if radii is not None and verlet.radii is not None:
         given = [(verlet.radii.sources, radii.sources), (verlet.radii.queries, radii.queries)]
         if verlet.radii.table is not None and radii.table is not None:  # species stay what they are
@@ -93,27 +78,27 @@ def has_moved_too_far(
             moved = moved | ((verlet.radii.table > 0) != (radii.table > 0)).any()
         for before, now in given:
             if before is not None and now is not None:
-                moved = moved | (is_radius(before) != is_radius(now)).any()
+                moved = moved | (geometry.is_radius(before) != geometry.is_radius(now)).any()
                 grown = jnp.maximum(grown, _growth(before, now))
     if box is not None or radii is not None:
-        half = widen(half, (used + grown) / 4)
+        half = geometry.widen(half, (used + grown) / 4)
     return moved | ~(extremes[0] < half.inside)  # `inside` has a margin of 8 eps, so what is below is surely closer
 
 
 def _growth(before: Array, now: Array) -> Array:
     """Return an upper bound on the growth of a cutoff."""
-    grown = jnp.where(is_radius(before) & is_radius(now), now - before, 0)
+    grown = jnp.where(geometry.is_radius(before) & geometry.is_radius(now), now - before, 0)
     return jnp.max(grown, initial=0) * (1 + 4 * jnp.finfo(grown.dtype).eps)
 
 
-def _find_extremes(before: Array, now: Array, lattice: Lattice | None, half_skin: Cutoff) -> Array:
+def _find_extremes(before: Array, now: Array, lattice: geometry.Lattice | None, half_skin: geometry.Cutoff) -> Array:
     """Return the largest scaled square of a motion, infinite where rounding leaves it open, in one reduction.
 
     In a box, behind it come for each axis the largest numbers of lattice vectors that a point lies from the box, backward and
     forward (`Motion.home`).
     """
-    motion = None if lattice is None else motion_of(before, now, lattice)
-    square = squared_distance(list((now - before).T) if motion is None else motion.axes, half_skin)
+    motion = None if lattice is None else geometry.motion_of(before, now, lattice)
+    square = geometry.squared_distance(list((now - before).T) if motion is None else motion.axes, half_skin)
     square = square if motion is None else jnp.where(motion.sure, square, jnp.inf)
     there = jnp.isfinite(before).all(axis=1) | jnp.isfinite(now).all(axis=1)
     rows = [jnp.where(there, square, 0)]
@@ -125,7 +110,12 @@ def _find_extremes(before: Array, now: Array, lattice: Lattice | None, half_skin
 
 
 def first_verlet(
-    positions: Array, queries: Array | None, box: Box | None, kind: Images | None, radii: Radii | None, batch: Batch | None
+    positions: Array,
+    queries: Array | None,
+    box: geometry.Box | None,
+    kind: geometry.Images | None,
+    radii: geometry.Radii | None,
+    batch: geometry.Batch | None,
 ) -> Verlet:
     """Return the state of a list that was just made."""
     positions, queries, box, radii = lax.stop_gradient((positions, queries, box, radii))

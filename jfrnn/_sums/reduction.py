@@ -11,25 +11,8 @@ import numpy as np
 from jax import Array, lax
 from jax.core import Tracer
 
+from jfrnn import _geometry as geometry
 from jfrnn._engine import Inputs, Options, find_bits, hide_inactive, rows_asked
-from jfrnn._geometry import (
-    EXCHANGED,
-    ROWS_ARE_WHOLE,
-    Batch,
-    Box,
-    Images,
-    Lattice,
-    Radii,
-    Status,
-    are_whole,
-    check_cutoff,
-    good_rows,
-    known_status,
-    make_cutoffs,
-    mark_rows,
-    one_or_nan,
-    translation,
-)
 from jfrnn._search import MOST_SLOTS, EdgeList, NeighborList, Problem, find_ends, kept_list, lattice_of_rows
 from jfrnn._sums.extremes import bind_extremes
 from jfrnn._sums.pair_function import call_with_pair
@@ -50,7 +33,7 @@ class Pairs(NamedTuple):
     half: bool  # each pair is listed once, and counts for both particles
     sources: Array
     rows: Array
-    lattice: Lattice | None
+    lattice: geometry.Lattice | None
     largest: Any  # the largest cutoff
     directionless: bool
     mark: Callable[[list[Array]], list[Array]] | None
@@ -65,14 +48,14 @@ def pairs_of_search(problem: Problem, inputs: Inputs, summed: bool) -> Pairs:
     options = problem.options
     sources, queries, active, box, cutoff, batch, exclude = inputs
     fixed = lax.stop_gradient(inputs._replace(sources=hide_inactive(sources, active), active=None))
-    relation, several = Searched(fixed, options), isinstance(cutoff, Radii)
-    largest = make_cutoffs(cutoff, options.closed).largest if isinstance(cutoff, Radii) else cutoff.radius
+    relation, several = Searched(fixed, options), isinstance(cutoff, geometry.Radii)
+    largest = geometry.make_cutoffs(cutoff, options.closed).largest if isinstance(cutoff, geometry.Radii) else cutoff.radius
     lattice = _lattice(box, options.images, sources, batch)
     sources, queries = _bring_near(sources, queries, box, options.images, batch)
     unsure = (exclude is not None and exclude.valid is not None) or (batch is not None and batch.fit is not None)
     doubtful = by_data = several or box is not None or unsure
     if doubtful:
-        known = known_status(call_apart(lambda inputs: find_bits(inputs, options), inputs))
+        known = geometry.known_status(call_apart(lambda inputs: find_bits(inputs, options), inputs))
         problem.refuse(known, inputs)
         doubtful = known is None
     if summed and active is None and not by_data:
@@ -86,7 +69,7 @@ def pairs_of_list(
     positions: Points,
     cutoff: Given,
     queries: Points | None,
-    box: Box | None,
+    box: geometry.Box | None,
     given: dict[str, bool],
     full: bool,
 ) -> Pairs:
@@ -100,19 +83,19 @@ def pairs_of_list(
     sources, rows, box = nbrs._geometry_inputs(positions, queries, box)
     dtype = np.dtype(sources.dtype)
     if cutoff is not None:
-        asked = check_cutoff(cutoff, dtype)
+        asked = geometry.check_cutoff(cutoff, dtype)
         if nbrs.cutoff is None or asked > nbrs.cutoff:
             has = "a cutoff per particle" if nbrs.cutoff is None else f"cutoff={nbrs.cutoff}"
             raise ValueError(f"cutoff must be None or at most that of the list, which has {has}, got {cutoff!r}.")
         nbrs = dataclasses.replace(nbrs, problem=dataclasses.replace(nbrs.problem, cutoff=asked))
     own = nbrs.own_queries
     fixed_rows = lax.stop_gradient(rows)
-    directionless = not own and (nbrs.radii is None or nbrs.radii.rule not in EXCHANGED)
+    directionless = not own and (nbrs.radii is None or nbrs.radii.rule not in geometry.EXCHANGED)
     relation = _relation_of_list(nbrs, *lax.stop_gradient((sources, rows, box)), symmetric=directionless and not nbrs.half)
     lattice = _lattice(box, nbrs.box_kind, sources, nbrs.batch)
     sources, asking = _bring_near(sources, rows if own else None, box, nbrs.box_kind, nbrs.batch)
     rows = sources if asking is None else asking
-    largest = nbrs.cutoff if nbrs.radii is None else make_cutoffs(lax.stop_gradient(nbrs.radii), nbrs.closed).largest
+    largest = nbrs.cutoff if nbrs.radii is None else geometry.make_cutoffs(lax.stop_gradient(nbrs.radii), nbrs.closed).largest
     masked = nbrs.masked or (nbrs.box is not None and nbrs.box.per_system)
     held = (nbrs.count if isinstance(nbrs, NeighborList) else jnp.diff(nbrs.offsets)) if masked and not own else None
     data, harmless = (nbrs.status, held, fixed_rows), (nbrs._harmless,)
@@ -121,7 +104,7 @@ def pairs_of_list(
 
 
 def _relation_of_list(
-    nbrs: NeighborList | EdgeList, sources: Array, rows: Array, box: Box | None, symmetric: bool
+    nbrs: NeighborList | EdgeList, sources: Array, rows: Array, box: geometry.Box | None, symmetric: bool
 ) -> Kept | Listed | Flat:
     """Return the pairs of a list: of padded ones Warp's kernels decide while they sum; else all is decided at once."""
     if isinstance(nbrs, EdgeList):
@@ -132,7 +115,7 @@ def _relation_of_list(
     if empty or not present.native or nbrs.idx.size > MOST_SLOTS:
         _, mask, shifts = nbrs._geometry_of(sources, rows, box)
         return Listed(idx=nbrs.idx, mask=mask, shifts=shifts, source_count=nbrs.source_count, symmetric=symmetric)
-    nbrs._check_known(spared=ROWS_ARE_WHOLE)
+    nbrs._check_known(spared=geometry.ROWS_ARE_WHOLE)
     given = call_apart(kept_list, present)
     known = nbrs.reverse if nbrs.reverse is not None and nbrs.reverse.starts is not None else None
     return Kept(given, known, symmetric)
@@ -141,27 +124,27 @@ def _relation_of_list(
 @functools.partial(compile_program, static_argnames=("options", "doubtful"))
 def _good_rows_of_search(inputs: Inputs, options: Options, doubtful: bool) -> Array:
     """Say which rows [m] of a search are valid; `doubtful` says that the data decide whether pairs may be missing."""
-    return good_rows(*rows_asked(inputs), are_whole(find_bits(inputs, options)) if doubtful else None)
+    return geometry.good_rows(*rows_asked(inputs), geometry.are_whole(find_bits(inputs, options)) if doubtful else None)
 
 
 @functools.partial(compile_program, static_argnames=("harmless",))
-def _good_rows_of_list(status: Array, count: Array | None, points: Array, harmless: Status) -> Array:
+def _good_rows_of_list(status: Array, count: Array | None, points: Array, harmless: geometry.Status) -> Array:
     """Say which rows [m] of a list are valid. If particles may be inactive, `count` is given: those with neighbors are active."""
-    active = None if count is None else (count > 0) | ((status & Status.NONFINITE.value) != 0)
-    return good_rows(points, active, are_whole(status, harmless))
+    active = None if count is None else (count > 0) | ((status & geometry.Status.NONFINITE.value) != 0)
+    return geometry.good_rows(points, active, geometry.are_whole(status, harmless))
 
 
 def _prepare_marks(
-    sources: Array, queries: Array | None, good_rows: Callable[..., Array], data: tuple, static: tuple = ()
+    sources: Array, queries: Array | None, are_good: Callable[..., Array], data: tuple, static: tuple = ()
 ) -> tuple[Array, Array, Callable[[list[Array]], list[Array]]]:
     """Return sources, rows and a function that marks invalid rows; derivatives in invalid rows of the positions are NaN.
 
-    `good_rows(*data, *static)` says which rows are valid. For concrete arrays one program evaluates and applies it.
+    `are_good(*data, *static)` says which rows are valid. For concrete arrays one program evaluates and applies it.
     """
     points = sources if queries is None else queries
     if not isinstance(points, Tracer):  # no derivatives are taken
-        return sources, points, functools.partial(_mark_by, data=data, good_rows=good_rows, static=static)
-    good = call_apart(lambda *data: good_rows(*data, *static), *data)
+        return sources, points, functools.partial(_mark_by, data=data, are_good=are_good, static=static)
+    good = call_apart(lambda *data: are_good(*data, *static), *data)
     points = _mark_derivatives(points, good)
     return points if queries is None else sources, points, functools.partial(_mark, good=good)
 
@@ -175,10 +158,12 @@ def _mark_derivatives(points: Array, good: Array) -> Array:
 @_mark_derivatives.defjvp
 def _mark_derivatives_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Any]) -> tuple[Array, Array]:
     points, good = primals
-    return points, tangents[0] * one_or_nan(good, tangents[0])
+    return points, tangents[0] * geometry.one_or_nan(good, tangents[0])
 
 
-def _lattice(box: Box | None, images: Images | None, like: Array, batch: Batch | None) -> Lattice | None:
+def _lattice(
+    box: geometry.Box | None, images: geometry.Images | None, like: Array, batch: geometry.Batch | None
+) -> geometry.Lattice | None:
     """Return the lattice of all pairs or, where each system has a box of its own, of each row."""
     if box is None or images is None:
         return None
@@ -187,7 +172,7 @@ def _lattice(box: Box | None, images: Images | None, like: Array, batch: Batch |
 
 
 def _bring_near(
-    sources: Array, queries: Array | None, box: Box | None, images: Images | None, batch: Batch | None
+    sources: Array, queries: Array | None, box: geometry.Box | None, images: geometry.Images | None, batch: geometry.Batch | None
 ) -> tuple[Array, Array | None]:
     """Return sources and queries near the box, as engines see them; differentiable in positions and box."""
     if box is None or images is None or images.counts_short:
@@ -197,7 +182,7 @@ def _bring_near(
 
 @functools.partial(compile_program, static_argnames="images")
 def _near_points(
-    sources: Array, queries: Array | None, box: Box, batch: Batch | None, images: Images
+    sources: Array, queries: Array | None, box: geometry.Box, batch: geometry.Batch | None, images: geometry.Images
 ) -> tuple[Array, Array | None]:
     ends = find_ends(sources, sources if queries is None else queries, box, images, batch, False)
     return ends.sources.points, None if queries is None else ends.rows.points
@@ -272,7 +257,7 @@ def _summand(
         matrix, own, others = [*matrix, *own[: len(each)]], own[len(each) :], others[len(theirs_too) :]
         r = x_j - x_i
         if lattice is not None:
-            r = r + translation(shift, dataclasses.replace(lattice, matrix=matrix[0]))
+            r = r + geometry.translation(shift, dataclasses.replace(lattice, matrix=matrix[0]))
         r = jnp.where(real, r, harmless)  # for masked slots, an input for which fn raises nothing in debug modes
         i, j = jax.tree.unflatten(own_tree, own), jax.tree.unflatten(other_tree, others)
         if symmetry is None:
@@ -340,7 +325,7 @@ def _mark(leaves: list[Array], good: Array) -> list[Array]:
 
 @functools.partial(compile_program, static_argnames=("dtype",))
 def _factors(good: Array, dtype: np.dtype) -> Array:
-    return one_or_nan(good, jax.ShapeDtypeStruct(good.shape, dtype))
+    return geometry.one_or_nan(good, jax.ShapeDtypeStruct(good.shape, dtype))
 
 
 @compile_program
@@ -348,9 +333,9 @@ def _multiply(leaves: list[Array], good: Array, factors: dict[str, Array]) -> li
     def spread(x: Array) -> Array:
         return factors[np.dtype(x.dtype).name].reshape(-1, *[1] * (x.ndim - 1))
 
-    return [x * spread(x) if jnp.issubdtype(x.dtype, jnp.floating) else mark_rows(x, good) for x in leaves]
+    return [x * spread(x) if jnp.issubdtype(x.dtype, jnp.floating) else geometry.mark_rows(x, good) for x in leaves]
 
 
-@functools.partial(compile_program, static_argnames=("good_rows", "static"))
-def _mark_by(leaves: list[Array], data: tuple, good_rows: Callable[..., Array], static: tuple) -> list[Array]:
-    return _mark(leaves, good_rows(*data, *static))
+@functools.partial(compile_program, static_argnames=("are_good", "static"))
+def _mark_by(leaves: list[Array], data: tuple, are_good: Callable[..., Array], static: tuple) -> list[Array]:
+    return _mark(leaves, are_good(*data, *static))

@@ -16,23 +16,12 @@ from jax.core import ShapedArray
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
+from jfrnn import _tracing as tracing
 from jfrnn._sums.exchange import signs_of
 from jfrnn._sums.fused import can_sum_list, check
 from jfrnn._sums.joint import lower_sum
 from jfrnn._sums.relations import Kept, Relation, Searched, sum_pairs
 from jfrnn._sums.terms import Derived, Groups, Term, choose, is_moving, join, tangent, transpose
-from jfrnn._tracing import (
-    Aval,
-    Internal,
-    call_apart,
-    compile_program,
-    lower_late,
-    on_device,
-    result_aval,
-    unvarying_types,
-    vary,
-    varying_axes,
-)
 
 Structure = Any  # the `PyTreeDef` of a relation, which type checkers do not accept as a type
 
@@ -43,7 +32,7 @@ _pair_sum_p.multiple_results = True
 def bind_sum(relation: Relation, term: Term, operands: Groups, compensated: bool) -> list[Array]:
     """Sum a term over the pairs of a relation, differentiable in the operands to every order; see `sum_pairs`."""
     leaves, structure = jax.tree.flatten(relation)
-    leaves = [x if isinstance(x, Array) else on_device(x) for x in leaves]  # numbers take no program to get there
+    leaves = [x if isinstance(x, Array) else tracing.on_device(x) for x in leaves]  # numbers take no program to get there
     return _bind(leaves, operands, term, structure, compensated)
 
 
@@ -53,9 +42,11 @@ def _bind(leaves: list[Array], operands: Groups, term: Term, structure: Structur
     if isinstance(relation, Searched):
         check(relation.inputs, relation.options, term)
     elif isinstance(relation, Kept) and not can_sum_list(relation.given, term):
-        leaves, structure = jax.tree.flatten(call_apart(Kept.listed, relation))  # once: derivatives are summed in the same way
-    axes = varying_axes((leaves, flat))
-    leaves, flat = vary((leaves, flat), axes)
+        leaves, structure = jax.tree.flatten(
+            tracing.call_apart(Kept.listed, relation)
+        )  # once: derivatives are summed in the same way
+    axes = tracing.varying_axes((leaves, flat))
+    leaves, flat = tracing.vary((leaves, flat), axes)
     return _pair_sum_p.bind(*leaves, *flat, term=term, structure=structure, compensated=compensated)
 
 
@@ -64,11 +55,11 @@ def _sums(*args: Array, term: Term, structure: Structure, compensated: bool) -> 
     return sum_pairs(jax.tree.unflatten(structure, args[:cut]), term, term.split(args[cut:]), compensated)
 
 
-def _result_shapes(*args: Aval, term: Term, structure: Structure, compensated: bool) -> list[ShapedArray]:
+def _result_shapes(*args: tracing.Aval, term: Term, structure: Structure, compensated: bool) -> list[ShapedArray]:
     del compensated
     rows = jax.tree.unflatten(structure, args[: structure.num_leaves]).sizes[0]
     return [
-        result_aval(x.shape if total else (rows, *x.shape), x.dtype, args)
+        tracing.result_aval(x.shape if total else (rows, *x.shape), x.dtype, args)
         for x, total in zip(term.summands, term.totals, strict=True)
     ]
 
@@ -87,7 +78,7 @@ def _jvp(primals: tuple, tangents: tuple, *, term: Term, structure: Structure, c
     return sums, [next(moved) if is_moving(x) else zero for x, zero in zip(term.summands, none, strict=True)]
 
 
-def _transpose(cotangents: list, *args: Internal, term: Term, structure: Structure, compensated: bool) -> list:
+def _transpose(cotangents: list, *args: tracing.Internal, term: Term, structure: Structure, compensated: bool) -> list:
     cut = structure.num_leaves
     leaves, operands = list(args[:cut]), term.split(args[cut:])
     relation = jax.tree.unflatten(structure, leaves)
@@ -123,7 +114,7 @@ def _bind_derived(leaves: list, operands: Groups, derived: Derived, structure: S
     return _bind(leaves, choose(operands, derived.needed), derived.term, structure, compensated)
 
 
-def _batch(args: tuple, dims: tuple, **params: Internal) -> tuple[list[Array], list[int]]:
+def _batch(args: tuple, dims: tuple, **params: tracing.Internal) -> tuple[list[Array], list[int]]:
     """Run the sums of a batch one after the other, since their loops have different lengths."""
     mapped = [d is not None for d in dims]
     batched = [jnp.moveaxis(x, d, 0) for x, d, is_mapped in zip(args, dims, mapped, strict=True) if is_mapped]
@@ -136,12 +127,12 @@ def _batch(args: tuple, dims: tuple, **params: Internal) -> tuple[list[Array], l
     return sums, [0] * len(sums)
 
 
-def _lower(ctx: Internal, *args: Internal, **params: Internal) -> Internal:
+def _lower(ctx: tracing.Internal, *args: tracing.Internal, **params: tracing.Internal) -> tracing.Internal:
     """Trace the sums as on a single device; see `jfrnn._tracing.late`."""
-    return lower_sum(lower_late(_sums), ctx.replace(avals_in=unvarying_types(ctx.avals_in)), *args, **params)
+    return lower_sum(tracing.lower_late(_sums), ctx.replace(avals_in=tracing.unvarying_types(ctx.avals_in)), *args, **params)
 
 
-_compiled = functools.partial(compile_program, static_argnames=("term", "structure", "compensated"))(_pair_sum_p.bind)
+_compiled = functools.partial(tracing.compile_program, static_argnames=("term", "structure", "compensated"))(_pair_sum_p.bind)
 _pair_sum_p.def_impl(lambda *args, **params: (_sums if jax.config.jax_disable_jit else _compiled)(*args, **params))  # pyright: ignore[reportAttributeAccessIssue]
 _pair_sum_p.def_abstract_eval(_result_shapes)
 ad.primitive_jvps[_pair_sum_p] = _jvp

@@ -47,12 +47,7 @@ class Program(Generic[_Args, _Result]):
 
     def _compile_anew(self) -> Any:  # noqa: ANN401
         """Return a jitted function of its own identity, with which all goes that JAX keeps of it, traces included."""
-
-        @functools.wraps(self._function)
-        def function(*args: _Args.args, **kwargs: _Args.kwargs) -> _Result:
-            return self._function(*args, **kwargs)
-
-        return jax.jit(function, **self._options)
+        return jax.jit(functools.partial(self._function), **self._options)
 
     def __call__(self, *args: _Args.args, **kwargs: _Args.kwargs) -> _Result:
         """Compile for new shapes, and run."""

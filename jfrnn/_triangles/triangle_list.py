@@ -11,20 +11,7 @@ import numpy as np
 from jax import Array, lax
 from jax.core import Tracer
 
-from jfrnn._geometry import (
-    Cutoff,
-    NeighborOverflowError,
-    Status,
-    are_whole,
-    check_again,
-    check_devices,
-    check_slack,
-    known_status,
-    make_cutoff,
-    mark_rows,
-    pairs_and_status,
-    shape_of,
-)
+from jfrnn import _geometry as geometry
 from jfrnn._search import norms, round_capacity
 from jfrnn._tracing import IndexRows, Points, Real, as_array, call_apart, compile_program, own_transfers
 from jfrnn._triangles.cells import TriangleCells, gather_corners
@@ -86,10 +73,10 @@ class TriangleList:
 
     def __repr__(self) -> str:
         """Summarize the list in a line; waits for the device."""
-        *batch, n, capacity = shape_of(self.idx)
+        *batch, n, capacity = geometry.shape_of(self.idx)
         rows = f"batch of {batch}, {n} particles" if batch else f"{n} particles"
-        faces = shape_of(self.faces)[-2]
-        rest = f"engine {self.backend!r}, {pairs_and_status(self.count, self.status)}"
+        faces = geometry.shape_of(self.faces)[-2]
+        rest = f"engine {self.backend!r}, {geometry.pairs_and_status(self.count, self.status)}"
         return f"TriangleList({rows}, {faces} triangles, capacity {capacity}, cutoff {self.cutoff:.6g}, {rest})"
 
     @property
@@ -105,7 +92,7 @@ class TriangleList:
     def overflow(self) -> Array:
         """Whether a row lost triangles, shape [], bool."""
         with own_transfers():
-            return (self.status & Status.ROW_OVERFLOW.value) != 0
+            return (self.status & geometry.Status.ROW_OVERFLOW.value) != 0
 
     def update(self, positions: Points, vertices: Points | None = None) -> "TriangleList":
         """Rebuild the list at these positions, in the same shapes: a simulation step inside `jax.jit` or `lax.scan`.
@@ -150,7 +137,7 @@ class TriangleList:
         if any(isinstance(x, Tracer) for x in jax.tree.leaves((points, corners, self.required))):
             raise TypeError("grow() changes the shape of the list and cannot run inside jax.jit: call it on what jit returns.")
         with own_transfers():
-            slack = check_slack(slack)
+            slack = geometry.check_slack(slack)
             met = round_capacity(math.ceil(slack * int(np.max(np.asarray(self.required)))))
         counted = count_slots(points, corners, self.faces, self.cutoff, self._engine, slack)
         capacity, cells = max(self.capacity, met, counted), self.cells if vertices is None else None
@@ -172,20 +159,20 @@ class TriangleList:
         if isinstance(self.status, Tracer):
             raise TypeError("check() reads values and cannot run inside jax.jit: call it on the list that jit returns.")
         self._check_rows()
-        status = known_status(self.status)
+        status = geometry.known_status(self.status)
         if status:
             raise ValueError(status.message)
 
     def _check_rows(self) -> None:
         """Raise if rows are known to lack triangles; a traced list is not checked."""
-        if Status.ROW_OVERFLOW in (known_status(self.status) or Status.OK):
-            raise NeighborOverflowError(int(np.max(jax.device_get(self.required))), self.capacity)
+        if geometry.Status.ROW_OVERFLOW in (geometry.known_status(self.status) or geometry.Status.OK):
+            raise geometry.NeighborOverflowError(int(np.max(jax.device_get(self.required))), self.capacity)
 
     def _mark(self, x: Array) -> Array:
         """Return what was computed of the rows; where the list is traced, NaN if triangles may be missing."""
         if not isinstance(self.status, Tracer):
             return x  # `_check_rows` has raised
-        return mark_rows(x, are_whole(self.status, ~Status.ROW_OVERFLOW))
+        return geometry.mark_rows(x, geometry.are_whole(self.status, ~geometry.Status.ROW_OVERFLOW))
 
     def closest(self, positions: Points, vertices: Points | None = None) -> tuple[Array, Array, Array]:
         """Compute the nearest point of every triangle in a row.
@@ -341,12 +328,12 @@ class TriangleList:
 
     def _check_points(self, positions: Points, vertices: Points | None) -> tuple[Array, Array]:
         dtype, (count, dim) = np.dtype(self.vertices.dtype), self.vertices.shape
-        points = check_again("positions", positions, dtype, dim, self.idx.shape[0])
-        check_devices("positions", points, self.idx)
+        points = geometry.check_again("positions", positions, dtype, dim, self.idx.shape[0])
+        geometry.check_devices("positions", points, self.idx)
         if vertices is None:
             return points, self.vertices
-        corners = check_again("vertices", vertices, dtype, dim, count)
-        check_devices("vertices", corners, self.idx)
+        corners = geometry.check_again("vertices", vertices, dtype, dim, count)
+        geometry.check_devices("vertices", corners, self.idx)
         return points, corners
 
 
@@ -356,7 +343,7 @@ def _nearest_in_rows(tri: TriangleList, points: Array, vertices: Array) -> tuple
     used = lax.broadcasted_iota(jnp.int32, tri.idx.shape, 1) < tri.count[:, None]
     corners, finite, there = gather_corners(vertices, tri.faces)
     triangle = jnp.where(used, tri.idx, 0)
-    cutoff = make_cutoff(tri.cutoff, np.dtype(points.dtype), closed=False)
+    cutoff = geometry.make_cutoff(tri.cutoff, np.dtype(points.dtype), closed=False)
     are_pairs = functools.partial(are_near, decide=tri._engine.decide)
     near = call_apart(are_pairs, *lax.stop_gradient((points, corners)), triangle, cutoff, used & (finite & there)[triangle])
     mask = near & jnp.all(jnp.isfinite(points), axis=1)[:, None]
@@ -390,7 +377,7 @@ def _are_parted(tri: TriangleList, points: Array, vertices: Array, pairs: Array)
 def _signed_distance(tri: TriangleList, points: Array, vertices: Array) -> SignedDistance:
     corners, finite, there = gather_corners(vertices, tri.faces)
     fixed, at, good = *lax.stop_gradient((corners, points)), finite & there
-    cutoff, used = make_cutoff(tri.cutoff, np.dtype(points.dtype), closed=False), jnp.minimum(tri.count, tri.capacity)
+    cutoff, used = geometry.make_cutoff(tri.cutoff, np.dtype(points.dtype), closed=False), jnp.minimum(tri.count, tri.capacity)
     slot, some = call_apart(functools.partial(nearest_slots, decide=tri._engine.decide), at, fixed, tri.idx, used, good, cutoff)
     triangle = jnp.where(some, jnp.take_along_axis(tri.idx, slot[:, None], axis=1)[:, 0], 0)
     shapes = jnp.where(some[:, None, None], corners[triangle], 0)
@@ -410,7 +397,13 @@ def _signed_distance(tri: TriangleList, points: Array, vertices: Array) -> Signe
 
 
 def _sides(
-    engine: TriangleEngine, tree: TriangleTree | None, corners: Array, points: Array, good: Array, asked: Array, cutoff: Cutoff
+    engine: TriangleEngine,
+    tree: TriangleTree | None,
+    corners: Array,
+    points: Array,
+    good: Array,
+    asked: Array,
+    cutoff: geometry.Cutoff,
 ) -> tuple[Array, Array]:
     """Say which of the points asked for are inside, and which of them no ray decides: [n] bool each."""
     tree = grow_tree(corners, good, cutoff) if tree is None else tree

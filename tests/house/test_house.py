@@ -95,8 +95,16 @@ def taken_from(path):
         elif isinstance(node, ast.ImportFrom):
             above = [".".join(package_of(path).split(".")[: 1 - node.level or None])] if node.level else []
             module = ".".join([*above, *([node.module] if node.module else [])])
-            taken += [(module, alias.name) for alias in node.names]
+            doors = {alias.asname: f"{module}.{alias.name}" for alias in node.names if alias.asname == alias.name.removeprefix("_")}
+            taken += [(module, alias.name) for alias in node.names if module != "jfrnn" or alias.asname not in doors]
+            taken += names_behind(tree, doors) if module == "jfrnn" else []
     return taken
+
+
+def names_behind(tree, doors):
+    """Return what a file reads of doors that it imports whole, by the names that it gives them: pairs as of `taken_from`."""
+    read = (node for node in ast.walk(tree) if isinstance(node, ast.Attribute))
+    return [(doors[x.value.id], x.attr) for x in read if isinstance(x.value, ast.Name) and x.value.id in doors]
 
 
 def package_of(path):

@@ -223,7 +223,7 @@ def test_jit_traces_once_for_new_positions():
 
 @pytest.mark.parametrize("backend", ["jax", "warp"])
 def test_one_program_serves_every_cutoff(backend):
-    from jfrnn._search.making import find_fields
+    from jfrnn._search.problem import find_fields
 
     points = random_points(77, 2, np.float32)
     jfrnn.search(points, 0.1, capacity=76, backend=backend)
