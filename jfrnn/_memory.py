@@ -12,20 +12,7 @@ import numpy as np
 from jax import Array
 from jax.sharding import SingleDeviceSharding
 
-from jfrnn._engine import (
-    ENGINES,
-    Engine,
-    Filter,
-    Inputs,
-    Options,
-    count_rows,
-    default_platform,
-    fastest_engine,
-    has_order,
-    list_flat,
-    list_rows,
-    parse_backend,
-)
+from jfrnn import _engine as engine
 from jfrnn._geometry import Cutoff, check_capacity, check_cutoff, check_flag, check_kind, check_size, check_skin, make_cutoff
 from jfrnn._search import check_total
 from jfrnn._sums import pair_sum
@@ -140,19 +127,21 @@ def memory_plan(
     dim, dtype = check_kind(dim, dtype)
     radius = make_cutoff(check_cutoff(cutoff, dtype), dtype, closed=False)
     rows = n if queries is None else queries
-    where = default_platform() if platform is None else platform
+    where = engine.default_platform() if platform is None else platform
     _check_parts(faces, queries, fn, capacity, gradient or values is not None)
     if total is not None and not (faces is None and fn is None and capacity is None):
         raise ValueError("total is that of a flat list, which has no capacity, no faces and no fn: leave them out.")
     if faces is not None:
         sizes = (n, check_size("faces", faces), dim, check_capacity(capacity))
-        return _plan_of_triangles(sizes, dtype, radius, parse_backend(backend, TRIANGLE_ENGINES, " with faces"), _device_of(where))
-    named = parse_backend(backend, ENGINES)
+        return _plan_of_triangles(
+            sizes, dtype, radius, engine.parse_backend(backend, TRIANGLE_ENGINES, " with faces"), _device_of(where)
+        )
+    named = engine.parse_backend(backend, engine.ENGINES)
     if fn is not None:
         points = _shapes_of(n, queries, dim, dtype)
         return _plan_of_sum(fn, points, float(cutoff), values, gradient, named, _device_of(where))
     capacity, total = None if capacity is None else check_capacity(capacity), None if total is None else check_total(total)
-    chosen = named or fastest_engine(_device_of(where).platform, n)
+    chosen = named or engine.fastest_engine(_device_of(where).platform, n)
     scratch = chosen.scratch_bytes(where, n, rows, dim, dtype == np.float64, queries is None, radius.scaled)
     if scratch is None:
         scratch = _compiled_scratch(_shapes_of(n, queries, dim, dtype, _device_of(where)), radius, chosen, capacity, total)
@@ -168,7 +157,7 @@ def memory_plan(
         return MemoryPlan(8 * total + 4 * (rows + 1) + 8 + kept, scratch, chosen.name)
     slots = rows * (capacity or 0)
     kept += 4 * slots + (0 if queries is None else 8 * n) if reverse else 0
-    kept += 4 * n if has_order(chosen, where, n, queries is None) else 0
+    kept += 4 * n if engine.has_order(chosen, where, n, queries is None) else 0
     return MemoryPlan(4 * (slots + rows) + 8 + kept, scratch, chosen.name)
 
 
@@ -200,15 +189,17 @@ def _device_of(platform: str) -> Device:
 
 
 def _compiled_scratch(
-    points: list[jax.ShapeDtypeStruct | None], cutoff: Cutoff, engine: Engine, capacity: Size | None, total: Size | None
+    points: list[jax.ShapeDtypeStruct | None], cutoff: Cutoff, chosen: engine.Engine, capacity: Size | None, total: Size | None
 ) -> int:
     """Compile the search, or the count, for these shapes, and return XLA's size of its temporary arrays [B]."""
-    options = Options(Filter(drop_self=points[1] is None, later_only=False), engine, closed=False)
-    inputs: Any = Inputs(points[0], points[1], None, None, cutoff)  # pyright: ignore[reportArgumentType] (shapes of arrays)
+    options = engine.Options(engine.Filter(drop_self=points[1] is None, later_only=False), chosen, closed=False)
+    inputs: Any = engine.Inputs(points[0], points[1], None, None, cutoff)  # pyright: ignore[reportArgumentType] (shapes of arrays)
     if total is not None:
-        lowered = list_flat.lower(inputs, options, total)
+        lowered = engine.list_flat.lower(inputs, options, total)
     else:
-        lowered = count_rows.lower(inputs, options) if capacity is None else list_rows.lower(inputs, options, capacity)
+        lowered = (
+            engine.count_rows.lower(inputs, options) if capacity is None else engine.list_rows.lower(inputs, options, capacity)
+        )
     return int(_analysis(lowered).temp_size_in_bytes)
 
 
@@ -218,7 +209,7 @@ def _plan_of_triangles(
     """Compile a search of n particles for triangles, in dim dimensions, with this capacity."""
     n, faces, dim, capacity = sizes
     at = SingleDeviceSharding(device)
-    chosen = named or fastest_of(device.platform, fastest_engine(device.platform, n))
+    chosen = named or fastest_of(device.platform, engine.fastest_engine(device.platform, n))
     points, corners = (jax.ShapeDtypeStruct((size, dim), dtype, sharding=at) for size in (n, faces // 2 + 2))
     triples: Any = jax.ShapeDtypeStruct((faces, dim), np.int32, sharding=at)
     analysis = _analysis(find_triangles.lower(points, corners, triples, None, cutoff, chosen, capacity))
@@ -239,7 +230,7 @@ def _plan_of_sum(
     cutoff: float,
     values: Tree,
     gradient: bool,
-    named: Engine | None,
+    named: engine.Engine | None,
     device: Device,
 ) -> MemoryPlan:
     """Compile a pair sum for sources and queries of these shapes, with the engine that "auto" means."""
@@ -260,7 +251,7 @@ def _plan_of_sum(
     with jax.default_device(device):
         if named is not None:
             return plan(named.name)
-        if fastest_engine(device.platform, 1).translates:
+        if engine.fastest_engine(device.platform, 1).translates:
             with contextlib.suppress(TypeError, ValueError, NotImplementedError):  # then "jax" sums it, or explains the error
                 return plan("warp")
         return plan("jax")

@@ -1,5 +1,6 @@
 """Pairs of one structure of atoms after another, from and to arrays of NumPy, with the arguments of ASE's functions."""
 
+import importlib
 import math
 from collections import defaultdict
 from collections.abc import Mapping
@@ -212,3 +213,22 @@ def _table(cutoff: Mapping, n: int, numbers: Given) -> tuple[np.ndarray, str, np
         if min(a, b) >= 0:
             table[a, b] = table[b, a] = number
     return table, "table", np.ascontiguousarray(species, np.int32)
+
+
+# --- what `jfrnn.ase` has besides its two functions, where ASE is installed -------------------------------------------
+
+_OURS = "NeighborList", "NewPrimitiveNeighborList", "PrimitiveNeighborList", "build_neighbor_list", "use"
+
+
+def name_of_ase(name: str) -> Any:  # noqa: ANN401
+    """Return a class of lists with our pairs, or what `ase.neighborlist` calls by a name."""
+    if name.startswith("__"):
+        raise AttributeError(name)
+    try:
+        theirs = importlib.import_module("ase.neighborlist")
+    except ImportError as error:
+        raise AttributeError(f"module 'jfrnn.ase' has {name!r} only if ASE is installed, which has it: {error}") from error
+    module = importlib.import_module("jfrnn._ase.lists") if name in _OURS else theirs
+    if not hasattr(module, name):
+        raise AttributeError(f"neither 'jfrnn.ase' nor 'ase.neighborlist' has an attribute {name!r}.")
+    return getattr(module, name)

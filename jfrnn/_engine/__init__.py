@@ -1,15 +1,6 @@
 """The engines, each a way to find the same pairs, and how XLA calls their kernels."""
 
-from jfrnn._engine.auto import (
-    ARRAYS,
-    ENGINES,
-    WARP,
-    choose_engine,
-    default_platform,
-    fastest_engine,
-    parse_backend,
-    platform_of,
-)
+from jfrnn._engine.auto import ARRAYS, ENGINES, WARP, choose_engine, default_platform, fastest_engine, parse_backend, platform_of
 from jfrnn._engine.kept_warp import KeptList, kept_distances, kept_mask, kept_slopes, kept_sums
 from jfrnn._engine.launch import Call, Shapes, kernel
 from jfrnn._engine.operands import MOST_IN_BOX, as_float

@@ -22,7 +22,6 @@ import numpy as np
 from jax import Array, lax
 
 from jfrnn import _geometry as geometry
-from jfrnn._engine.boxes import find_in_boxes
 from jfrnn._engine.candidates import NOWHERE, Candidates, Excluded, Points, Span, Torus
 from jfrnn._engine.problem import Features, Options, Room, Rows, Search, largest_radius
 from jfrnn._engine.runs import State, count_neighbors, fill_neighbors, list_neighbors
@@ -168,7 +167,11 @@ def fold_candidates(
 def _complete(search: Search, found: Candidates) -> Candidates:
     """Add to candidates what is excluded, and the points as they were given."""
     if search.exclude is not None:
-        found = found._replace(excluded=_place_excluded(found, search.exclude))
+        starts, others, codes = search.exclude
+        places = _places_of(found)[others]
+        if codes is not None and found.torus is None:  # those that stand nowhere are placed before all others
+            places, codes = jnp.where(codes < 0, NOWHERE, places), None
+        found = found._replace(excluded=Excluded(starts, places, codes))
     return found._replace(given=(search.sources, search.sources if search.queries is None else search.queries))
 
 
@@ -181,20 +184,15 @@ def _places_of(candidates: Candidates) -> Array:
     return jnp.full(n, NOWHERE, jnp.int32).at[ids].set(place, mode="drop")
 
 
-def _place_excluded(candidates: Candidates, exclude: geometry.ExcludedCodes) -> Excluded:
-    """Return where excluded sources stand among the candidates; those that stand nowhere are placed before all others."""
-    found = _places_of(candidates)[exclude.others]
-    if exclude.codes is None or candidates.torus is not None:
-        return Excluded(exclude.starts, found, exclude.codes)
-    return Excluded(exclude.starts, jnp.where(exclude.codes < 0, NOWHERE, found))
-
-
 def _clouds(search: Search) -> tuple[Array, Array | None, Torus | None]:
     """Return sources and queries, near the cell if there is a lattice, and what a lattice adds."""
     if search.torus is None:
         return search.sources, search.queries, None
-    wrapped = search.torus[1]
-    return wrapped.sources, None if search.queries is None else wrapped.queries, _torus(*search.torus, search.sources.dtype)
+    (lattice, wrapped), dtype = search.torus, search.sources.dtype
+    turns = tuple(geometry.unpack_turns(x, lattice.dim).astype(dtype) for x in (wrapped.turns, wrapped.query_turns))
+    shifts = geometry.translation(jnp.asarray(lattice.images.shifts).astype(dtype), lattice)
+    torus = Torus(lattice.images, shifts, lattice.given, (turns[0], turns[1]), wrapped.slack)
+    return wrapped.sources, None if search.queries is None else wrapped.queries, torus
 
 
 def _cells_along(search: Search, scale: Array | None) -> tuple[Array, geometry.CellAxes]:
@@ -212,12 +210,6 @@ def _cells_along(search: Search, scale: Array | None) -> tuple[Array, geometry.C
         return _cells_of_lattice(sources, queries, radius, lattice, wrapped)
     points = sources if queries is None else jnp.concatenate([sources, queries])
     return points.T, geometry.open_axes(geometry.cell_edge(radius), points.shape[1])
-
-
-def _torus(lattice: geometry.Lattice, wrapped: geometry.Wrapped, dtype: np.dtype) -> Torus:
-    turns = tuple(geometry.unpack_turns(x, lattice.dim).astype(dtype) for x in (wrapped.turns, wrapped.query_turns))
-    shifts = jnp.asarray(lattice.images.shifts).astype(dtype)
-    return Torus(lattice.images, geometry.translation(shifts, lattice), lattice.given, (turns[0], turns[1]), wrapped.slack)
 
 
 def _all_sources(search: Search) -> Candidates:
@@ -335,3 +327,41 @@ def _in_order(positions: Array, order: Array | None, radii: Array | None = None)
     if order is None:
         return Points(list(positions.T), lax.iota(jnp.int32, positions.shape[0]), radii)
     return Points([x[order] for x in positions.T], order, None if radii is None else radii[order])
+
+
+# --- where each system has a box of its own (`jfrnn._geometry.box_cells`) ---------------------------------------------
+
+_WIDTH = 27  # runs of a pass
+_WORDS = 64  # of candidates that a query tests at a time
+
+
+def find_in_boxes(search: Search, by_cells: bool) -> Candidates:
+    """Return as candidates of a query the sources in the cells around it, or all of its system, in the images within its reach."""
+    sources, queries, batch, torus = search.sources, search.queries, search.batch, search.torus
+    if batch is None or torus is None:
+        raise TypeError("a search with a box per system has a batch and a lattice.")
+    lattice, wrapped = torus
+    cells = geometry.sort_into_boxes(sources, queries, lattice, wrapped, batch, by_cells)
+    padded = jnp.pad(cells.order, (0, LANES))
+    order = cells.order if queries is None else lax.iota(jnp.int32, len(queries))
+    systems = batch.of_queries[order]
+    cells = cells._replace(from_cell=cells.from_cell[order], visited=cells.visited[order])
+
+    def runs(span: Span, which: Array) -> tuple[Array, Array, Array]:
+        return geometry.box_runs(cells, systems, lattice, span.places, which, _WIDTH)
+
+    def passes(span: Span) -> Array:
+        return geometry.passes_of(cells, systems, span.places, _WIDTH)
+
+    own = lattice.of_rows(systems)
+    shifts = jnp.asarray(lattice.images.shifts)
+    turns = tuple(geometry.unpack_turns(x, lattice.dim).astype(sources.dtype) for x in (wrapped.turns, wrapped.query_turns))
+    matrix = jnp.concatenate([own.matrix, own.given], axis=1) if lattice.images.short else own.matrix  # the short vectors first
+    matrix = jnp.moveaxis(matrix, 0, -1)
+    images = Torus(lattice.images, shifts.astype(sources.dtype), matrix, (turns[0], turns[1]), wrapped.slack[systems])
+    radii = search.cutoff.of_points if isinstance(search.cutoff, geometry.Cutoffs) else (None, None)
+    points, rows = (
+        Points([x[at] for x in of.T], at, None if each is None else each[at])
+        for of, at, each in ((wrapped.sources, padded, radii[0]), (wrapped.queries, order, radii[1]))
+    )
+    return Candidates(points, rows, runs, images, len(sources), lambda _: _WORDS, passes)

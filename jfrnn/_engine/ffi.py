@@ -46,11 +46,7 @@ class Api(ctypes.Structure):
 class CallFrame(ctypes.Structure):
     """The first fields of what XLA hands over with a call."""
 
-    _fields_ = (
-        ("struct_size", ctypes.c_size_t),
-        ("extension", ctypes.POINTER(Extension)),
-        ("api", ctypes.POINTER(Api)),
-    )
+    _fields_ = (("struct_size", ctypes.c_size_t), ("extension", ctypes.POINTER(Extension)), ("api", ctypes.POINTER(Api)))
 
     def tell_version(self) -> bool:
         """Say whether this is no call but a question for the version of the interface, and answer it."""

@@ -23,7 +23,7 @@ def slots_by_source(idx: Array, sources: int) -> tuple[Array, Array, Array]:
 
 
 def collect_slots(values: Array, slots: Array, starts: Array | None, lengths: Array | None, sources: int, cuda: bool) -> Array:
-    """Return the sums of values [slots, width] over the slots of each source [sources, width]; see `jfrnn._search.reverse`."""
+    """Return the sums of values [slots, width] over the slots of each source [sources, width]; see `jfrnn._search.present`."""
     by_source, nothing = starts is not None, jnp.zeros(1, jnp.int32)
     call = _collect_callable(values.shape[1], values.dtype == jnp.float64, by_source, cuda)
     given = values, slots, *(nothing if x is None else x for x in (starts, lengths))

@@ -140,7 +140,11 @@ def count_few(inputs: Inputs, options: Options) -> np.ndarray | None:
         or (box is not None and box.per_system)
     ):
         return None
-    if not _comes_rarely((n, sources.shape[1], sources.dtype.name, options)):
+    shape = n, sources.shape[1], sources.dtype.name, options
+    _seen[shape] = times = _seen.pop(shape, 0) + 1
+    while len(_seen) > _SHAPES:
+        _seen.popitem(last=False)
+    if times > _TIMES:
         return None
     known = [np.asarray(jax.device_get(x)) for x in (sources, *([] if box is None else [box.vectors]))]
     try:
@@ -164,11 +168,3 @@ def _structure(known: list[Any], box: Box | None, radius: float) -> Structure:
         periodic[: box.dim] = box.periodic
     x = np.pad(x, ((0, 0), (0, more)))
     return Structure(np.ascontiguousarray(x), vectors, periodic, np.array([radius]), "one")
-
-
-def _comes_rarely(shape: Any) -> bool:  # noqa: ANN401
-    times = _seen.pop(shape, 0) + 1
-    _seen[shape] = times
-    while len(_seen) > _SHAPES:
-        _seen.popitem(last=False)
-    return times <= _TIMES

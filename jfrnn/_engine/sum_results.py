@@ -56,7 +56,9 @@ class SumsOf(NamedTuple):
         width, totals = self._width, self._totals
         which = as_integer(rest).reshape(self.rows, width, 2) if self.kind.extremes else jnp.zeros((self.rows, width, 0), jnp.int32)
         found = (sums,) if more is None or not self.term.first else (sums, more)
-        return found, _add_parts(parts[: 2 * self.slots * totals].reshape(self.slots, 2, totals)), which
+        parts, zero = parts[: 2 * self.slots * totals].reshape(self.slots, 2, totals), jnp.zeros((), parts.dtype)
+        added = rounded_sum(*lax.reduce((parts[:, 0], parts[:, 1]), (zero, zero), compensated_sum, (0,)))  # in twice the precision
+        return found, added, which
 
     @property
     def _totals(self) -> int:
@@ -65,12 +67,6 @@ class SumsOf(NamedTuple):
     @property
     def _width(self) -> int:
         return len(self.term.sums) - self._totals
-
-
-def _add_parts(parts: Array) -> Array:
-    """Add partial sums [slots, 2, width], values and errors, in twice the precision."""
-    zero = jnp.zeros((), parts.dtype)
-    return rounded_sum(*lax.reduce((parts[:, 0], parts[:, 1]), (zero, zero), compensated_sum, (0,)))
 
 
 def beside_rows(term: TermText, values: tuple[Array, ...]) -> tuple[Array, Array, Array]:

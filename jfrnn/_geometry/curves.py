@@ -69,7 +69,7 @@ def morton_decode(keys: Array, dim: int, bits: int | None = None) -> Array:
     [[0, 0], [1, 0], [0, 1], [1, 1]]
     """
     keys, dim, bits = _check_keys(keys, dim, bits, default=True)
-    return _decode(keys, dim, bits, _morton_axes)
+    return _decode(keys, dim, bits, lambda words, dim, _: _separate(words, dim))
 
 
 def hilbert_encode(coords: Array, bits: int) -> Array:
@@ -140,10 +140,6 @@ def _decode(keys: Array, dim: int, bits: int, curve: Callable[[Words, int, int],
 
 def morton_words(axes: list[Array], _: int) -> Words:
     return _interleave(axes)
-
-
-def _morton_axes(words: Words, dim: int, _: int) -> list[Array]:
-    return _separate(words, dim)
 
 
 def hilbert_words(axes: list[Array], bits: int) -> Words:

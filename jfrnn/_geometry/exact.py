@@ -25,14 +25,7 @@ from jax import Array, lax
 
 from jfrnn._geometry.cutoffs import UNITS, Cutoff, Cutoffs, step_one_bounds
 from jfrnn._geometry.floats import WHOLE_BITS, two_sum, unit_scale
-from jfrnn._geometry.integers import (
-    carry_limbs,
-    full_count,
-    limb_product,
-    limb_sign,
-    limb_type,
-    limbs_of,
-)
+from jfrnn._geometry.integers import carry_limbs, full_count, limb_product, limb_sign, limb_type, limbs_of
 from jfrnn._geometry.reduced import Basis
 from jfrnn._tracing import largest_of
 

@@ -120,12 +120,8 @@ def _make_rows(xp: _ArrayModule, pairs: Given, sources: int, queries: int | None
 
 def _narrow(xp: _ArrayModule, shifts: Given) -> Given:
     """Return shifts as int32; one that does not fit belongs to an image too far away to be a neighbor."""
-    most = np.iinfo(np.int32).max // 4
-    return xp.clip(
-        shifts,
-        0 if np.issubdtype(shifts.dtype, np.unsignedinteger) else -min(most, np.iinfo(shifts.dtype).max),
-        min(most, np.iinfo(shifts.dtype).max),
-    ).astype(np.int32)
+    most = min(np.iinfo(np.int32).max // 4, np.iinfo(shifts.dtype).max)
+    return xp.clip(shifts, 0 if shifts.dtype.kind == "u" else -most, most).astype(np.int32)
 
 
 def _sort_rows(xp: _ArrayModule, used: Given, rows: Given, others: Given, shifts: Given, count: int) -> ExcludedRows:

@@ -18,10 +18,8 @@ from jfrnn._geometry.cutoffs import Cutoffs
 
 OCTAVES = 24  # the last one holds all shorter cutoffs
 _LITTLE = 1 - 2.0**-10
-_LONGER = (
-    "either",
-    "mean",
-)  # rules by which no cutoff of a pair is longer than the longer of both; by others, than the shorter one
+# rules by which no cutoff of a pair is longer than the longer of both; by others, than the shorter one
+_LONGER = ("either", "mean")
 
 
 class Part(NamedTuple):

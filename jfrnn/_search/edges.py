@@ -152,7 +152,9 @@ def flat_edges(present: Present, status: Array, mask: Array, shifts: Array | Non
     if near is not None:
         sources, rows = near.sources.points, near.rows.points
     senders = jnp.where(real, topology.idx.reshape(-1)[flat.slots], topology.sources)
-    ends = _by_sender(topology, flat.edges, total), _by_row(flat.offsets, capacity, total, topology.native)
+    of_slots = topology.with_reverse()
+    by_sender = of_slots._replace(slots=flat.edges.at[of_slots.slots].get(mode="fill", fill_value=total))
+    ends = by_sender, _by_row(flat.offsets, capacity, total, topology.native)
     sides = [
         gather(points, Topology(named[:, None], None, end, None, len(points), 1, end.starts is None, topology.native))[:, 0]
         for points, named, end in zip((sources, rows), (senders, flat.rows), ends, strict=True)
@@ -272,12 +274,6 @@ def edges_of_rows(offsets: Array, total: int) -> Reverse:
     """Return the edges of each receiver of a flat list."""
     held = jnp.minimum(offsets, total)
     return Reverse(lax.iota(jnp.int32, total), held[:-1], jnp.diff(held))
-
-
-def _by_sender(topology: Topology, edges: Array, total: int) -> Reverse:
-    """Return the edges of each source, from its slots."""
-    reverse = topology.with_reverse()
-    return reverse._replace(slots=edges.at[reverse.slots].get(mode="fill", fill_value=total))
 
 
 def _by_row(offsets: Array, capacity: int, total: int, native: bool) -> Reverse:

@@ -332,9 +332,8 @@ def _make_again_if_stale(nbrs: Kept, inputs: Inputs) -> Kept:
     now = hide_inactive(sources, take_present(inputs).active)
     moved = has_moved_too_far(nbrs.verlet, now, queries, box, nbrs.box_kind, radii, nbrs.skin, nbrs.batch)
     fixed = {"box": box, "radii": radii, "batch": nbrs.batch, "exclude": nbrs.exclude}
-    left_out = dict.fromkeys(
-        fixed
-    )  # what stays is no state of the loop, so that XLA derives from it once what steps of a scan need
+    # what stays is no state of the loop, so that XLA derives from it once what steps of a scan need
+    left_out = dict.fromkeys(fixed)
     state = moved, _replace(nbrs, **left_out)
 
     def body(state: tuple[Array, Kept]) -> tuple[Array, Kept]:

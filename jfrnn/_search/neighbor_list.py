@@ -1,37 +1,38 @@
-"""The result of a search: a padded neighbor list, its checks and its geometry.
-
-The methods of a public class stand here with whole docstrings; those that export it are in `list_exports`.
-"""
+"""The result of a search: a padded neighbor list, its checks, its geometry and its exports."""
 
 import dataclasses
+from typing import TypedDict, Unpack, overload
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array, lax
+from jax.core import Tracer
 
 from jfrnn._engine import Inputs, KeptRows, can_renew, renew_list
-from jfrnn._geometry import (
-    Box,
-    Status,
-    make_cutoff,
-    pairs_and_status,
-    shape_of,
-    widen,
-)
-from jfrnn._search.edges import Edges, Graph, flat_edges, make_graph, no_edges
-from jfrnn._search.exports import check_held, check_total, pair_total
+from jfrnn._geometry import Box, Status, make_cutoff, pairs_and_status, shape_of, widen
+from jfrnn._search.edges import Edges, Graph, flat_edges, flat_pairs_of, make_graph, no_edges
+from jfrnn._search.exports import DenseNeighbors, check_held, check_total, flat_pairs, pair_total
 from jfrnn._search.geometry import lattice_shifts, norms, vectors_of
-from jfrnn._search.list_exports import ListExports
+from jfrnn._search.kept_search import KeptSearch
 from jfrnn._search.present import MOST_SLOTS, Present, Topology, make_topology
 from jfrnn._search.problem import count_capacity, round_capacity
-from jfrnn._tracing import Points, Size, own_transfers
+from jfrnn._tracing import Points, Size, at_once, own_transfers
 
 _FEW_SLOTS = 1 << 18  # up to which a program takes longer to compile than its displacements to compute
 
 
+class Now(TypedDict, total=False):
+    """Where particles are now; without positions, exports hold all pairs of a list."""
+
+    positions: Array
+    queries: Array | None
+    box: Box | None
+
+
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
-class NeighborList(ListExports):
+class NeighborList(KeptSearch):
     """The neighbors of m queries among n sources, one row of `capacity` slots per query. A pytree.
 
     Attributes:
@@ -55,6 +56,8 @@ class NeighborList(ListExports):
         problem: The options of the search (`Problem`). Static.
     """
 
+    idx: Array
+    count: Array
     order: Array | None
     _round_room, _count_room = staticmethod(round_capacity), staticmethod(count_capacity)
 
@@ -62,6 +65,11 @@ class NeighborList(ListExports):
         """Summarize the list in a line; waits for the device."""
         *batch, m, capacity = shape_of(self.idx)
         return self._describe(batch, m, f"capacity {capacity}", pairs_and_status(self.count, self.status))
+
+    @property
+    def capacity(self) -> int:
+        """Slots per row."""
+        return self.idx.shape[-1]
 
     def require(self, total: int) -> "NeighborList":
         """Return this list with the bit `Status.TOTAL_OVERFLOW` set if it holds more than `total` pairs.
@@ -240,8 +248,84 @@ class NeighborList(ListExports):
             raise ValueError("to_jraph() makes particles the nodes of a graph, and this list has queries: take `edges`.")
         return make_graph(self.edges(positions, total, box=box), self._geometry_inputs(positions, None, box)[0])
 
-    def _near(self, positions: Points, queries: Points | None, box: Box | None) -> Array:
-        return self._geometry(positions, queries, box)[1]
+    @overload
+    def pairs(self, total: None = None, **at: Unpack[Now]) -> tuple[np.ndarray, np.ndarray]: ...
+
+    @overload
+    def pairs(self, total: int, **at: Unpack[Now]) -> tuple[Array, Array]: ...
+
+    def pairs(self, total: int | None = None, **at: Unpack[Now]) -> tuple[Array | np.ndarray, Array | np.ndarray]:
+        """Export the pairs (i, j), row by row: to the host, or inside jit into arrays of a static length.
+
+        Without positions these are all pairs of the list: with a skin, those within cutoff + skin when it was last rebuilt. With
+        `positions` they are those within the cutoff there, exactly, in the order of `nbrs.shifts(x)[nbrs.distances(x)[1]]`.
+
+        Args:
+            total: Length of the arrays, a static int up to 2³¹ - 1; None: the number of pairs, which is known only outside jit. If
+                there are more pairs than `total`, this raises outside jit. Inside jit the last pairs are missing then;
+                `require(total)` sets a bit that `check` reports.
+            **at: `positions` [length], shape [n, d], where the sources are now, with `queries` and `box` as in `vectors`.
+
+        Returns:
+            Query indices i and source indices j, shape [pairs] or [total], int32 each; the padding holds m and n.
+
+        Raises:
+            NeighborOverflowError, ValueError: as `check`, outside jit; ValueError: more pairs than `total`, outside jit.
+            ValueError, TypeError: total is invalid, or missing inside jit; or positions do not fit the list.
+
+        Differentiable: no (integers). Jit: yes, with total. vmap: yes, with total.
+        """
+        if total is None:
+            count, idx = self._check_rows("pairs", at)
+            return np.repeat(np.arange(count.size, dtype=np.int32), count), idx
+        rows, indices, _ = self._flat("pairs", total, at)
+        return rows, indices
+
+    @overload
+    def csr(self, total: None = None, **at: Unpack[Now]) -> tuple[np.ndarray, np.ndarray]: ...
+
+    @overload
+    def csr(self, total: int, **at: Unpack[Now]) -> tuple[Array, Array]: ...
+
+    def csr(self, total: int | None = None, **at: Unpack[Now]) -> tuple[Array | np.ndarray, Array | np.ndarray]:
+        """Export compressed rows: the neighbors of row i are indices[offsets[i]:offsets[i + 1]].
+
+        Args:
+            total: As in `pairs`; offsets[-1] is then the number of pairs in the rows, at most 2³¹ - 1, which inside jit may exceed
+                `total`.
+            **at: As in `pairs`.
+
+        Returns:
+            Offsets, shape [m + 1], int64 on the host, int32 with `total`; and indices, shape [pairs] or [total], int32, padded with
+            n.
+
+        Raises:
+            NeighborOverflowError, ValueError, TypeError: as in `pairs`.
+
+        Differentiable: no (integers). Jit: yes, with total. vmap: yes, with total.
+        """
+        if total is None:
+            count, idx = self._check_rows("csr", at)
+            return np.concatenate([[0], np.cumsum(count, dtype=np.int64)]), idx
+        _, indices, offsets = self._flat("csr", total, at)
+        return offsets, indices
+
+    def to_jax_md(self) -> DenseNeighbors:
+        """Return this list in the form that jax-md's energies take: `idx` as in its format `Dense`.
+
+        Such an energy computes displacements itself, so it needs a full list of the particles among themselves with minimum images
+        only; the box goes into its displacement function. It sees all pairs within cutoff + skin. Inside jit, the result's
+        `did_buffer_overflow` says whether neighbors are missing.
+
+        Raises:
+            ValueError: the list is half, has queries, or has several images per pair.
+            NeighborOverflowError, ValueError: as `check`, outside jit.
+        """
+        wrong = {"half=True": self.half, "queries": self.own_queries, "several images of a pair": self.images is not None}
+        for what in (name for name, is_so in wrong.items() if is_so):
+            raise ValueError(f"jax-md's Dense format cannot say what a list with {what} does: search without.")
+        self._check_known()
+        return DenseNeighbors(self.idx, self.status)
 
     @property
     def _room(self) -> int:
@@ -290,3 +374,64 @@ class NeighborList(ListExports):
         problem, codes = self.problem, None if self.images is None else self.images.codes
         kind = problem.options, problem.source_count, problem.own_queries, self.radii
         return make_topology(*kind, self.idx, codes, self.reverse, self.order)
+
+    def _flat(self, name: str, total: int, at: Now) -> tuple[Array, Array, Array]:
+        """Return rows and sources of the pairs, padded to a static length, and the row offsets."""
+        total, near = check_total(total), self._near_now(name, at)
+        self._check_single()
+        if near is None:
+            self._check_known()
+            if not isinstance(self.count, Tracer):
+                with at_once():
+                    check_held(pair_total(self.count, self.capacity), total)
+            return flat_pairs(self.idx, self.count, self.source_count, total)
+        with own_transfers():
+            *made, held = flat_pairs_of(self.idx, near, self.source_count, total, self.problem.options.engine.native)
+        check_held(held, total)
+        return made[0], made[1], made[2]
+
+    def _count_pairs(self, name: str) -> int:
+        """Return how many pairs the list holds, those of the skin included.
+
+        Raises:
+            TypeError: The list is traced.
+        """
+        if isinstance(self.count, Tracer):
+            raise TypeError(
+                f"{name}() makes arrays of a static length inside jax.jit: write {name}(positions, total), total being it."
+            )
+        self._check_known()
+        return int(np.asarray(self.count).sum(dtype=np.int64))
+
+    def _near_now(self, name: str, at: Now) -> Array | None:
+        for unknown in set(at) - set(Now.__annotations__):
+            raise TypeError(f"NeighborList.{name}() got an unexpected keyword argument {unknown!r}")
+        if "positions" in at:
+            return self._geometry(at["positions"], at.get("queries"), at.get("box"))[1]
+        if at:
+            raise TypeError(
+                f"{', '.join(at)} tell where pairs are now, with positions: pass positions=, or leave {next(iter(at))} out."
+            )
+        return None
+
+    def _check_rows(self, name: str, at: Now) -> tuple[np.ndarray, np.ndarray]:
+        if any(isinstance(x, Tracer) for x in (self.status, *at.values())):
+            raise TypeError(
+                f"{name}() returns as many pairs as there are and cannot run inside jax.jit: write {name}(total), total being the "
+                "static length of its arrays."
+            )
+        near = self._near_now(name, at)
+        if near is None:
+            self._check_known()
+        self._check_single()
+        with own_transfers():
+            idx, count = np.asarray(self.idx), np.asarray(self.count)
+            used = np.arange(self.capacity) < count[:, None] if near is None else np.asarray(near)
+        return used.sum(1), idx[used]
+
+    def _check_single(self) -> None:
+        if self.idx.ndim != 2:
+            raise ValueError(f"exports take one list at a time, got idx of shape {list(self.idx.shape)}: index the batch first.")
+
+    def _pairs_held(self) -> int:
+        return int(np.sum(jax.device_get(self.count), dtype=np.int64))

@@ -11,24 +11,8 @@ import numpy as np
 from jax import Array, lax
 from jax.core import Tracer
 
+from jfrnn import _engine as engine
 from jfrnn import _geometry as geometry
-from jfrnn._engine import (
-    ENGINES,
-    Features,
-    Filter,
-    Inputs,
-    Options,
-    choose_engine,
-    count_few,
-    count_rows,
-    find_rows,
-    has_order,
-    hide_inactive,
-    list_flat,
-    parse_backend,
-    platform_of,
-    take_present,
-)
 from jfrnn._search.culprits import name_culprits
 from jfrnn._search.geometry import real_points
 from jfrnn._search.present import ImageCodes, find_reverse, make_topology
@@ -64,7 +48,7 @@ class Problem:
         dtype: Dtype of the positions.
     """
 
-    options: Options
+    options: engine.Options
     cutoff: float | None
     skin: float
     own_queries: bool
@@ -92,16 +76,17 @@ class Problem:
         radii: geometry.Radii | None,
         batch: geometry.Batch | None,
         exclude: geometry.Exclusions | None,
-    ) -> Inputs:
+    ) -> engine.Inputs:
         """Return the operands of this search for these particles."""
         if radii is not None:
-            return Inputs(sources, queries, active, box, radii, batch, exclude)
+            return engine.Inputs(sources, queries, active, box, radii, batch, exclude)
         if self.cutoff is None:
             raise TypeError("a search needs a cutoff or radii.")
         reach = list_radius(self.cutoff, self.skin, self.dtype)
-        return Inputs(sources, queries, active, box, geometry.make_cutoff(reach, self.dtype, self.options.closed), batch, exclude)
+        cutoff = geometry.make_cutoff(reach, self.dtype, self.options.closed)
+        return engine.Inputs(sources, queries, active, box, cutoff, batch, exclude)
 
-    def refuse(self, status: geometry.Status | None, inputs: Inputs) -> None:
+    def refuse(self, status: geometry.Status | None, inputs: engine.Inputs) -> None:
         """Raise what bits report of a search of concrete particles, if any is set; None: they are not known.
 
         Raises:
@@ -198,7 +183,7 @@ class Asked(NamedTuple):
     active: Given = None
 
 
-def check_problem(asked: Asked) -> tuple["Problem", Inputs]:
+def check_problem(asked: Asked) -> tuple["Problem", engine.Inputs]:
     """Check what is asked; return its static part and the operands."""
     sources, queries = geometry.check_positions("positions", asked.positions), None
     if asked.queries is not None:
@@ -208,10 +193,8 @@ def check_problem(asked: Asked) -> tuple["Problem", Inputs]:
                 raise ValueError(f"{name}=True pairs particles with themselves or each other: it cannot be used with queries.")
     active, dtype = None if asked.active is None else geometry.check_active(asked.active, sources), np.dtype(sources.dtype)
     drop_self = queries is None and not geometry.check_flag("include_self", asked.include_self)
-    keep, closed = (
-        Filter(drop_self, later_only=geometry.check_flag("half", asked.half)),
-        geometry.check_flag("closed", asked.closed),
-    )
+    keep = engine.Filter(drop_self, later_only=geometry.check_flag("half", asked.half))
+    closed = geometry.check_flag("closed", asked.closed)
     if asked.species is None:
         radii = geometry.check_radii(asked.cutoff, asked.radius_rule, sources, queries)
     else:
@@ -229,14 +212,14 @@ def check_problem(asked: Asked) -> tuple["Problem", Inputs]:
     if box is not None and box.per_system and asked.batch is None:
         raise ValueError("box holds a box per system: pass batch=, the system of each particle (from 0 on; -1: in none of them).")
     images = None if box is None else geometry.images_of(box, reach, dtype, sources.shape[0])
-    features = Features(box is not None, asked.batch is not None, radii is not None, excluding=asked.exclude is not None)
-    engine = choose_engine(parse_backend(asked.backend, ENGINES), sources, queries, features)
+    features = engine.Features(box is not None, asked.batch is not None, radii is not None, excluding=asked.exclude is not None)
+    chosen = engine.choose_engine(engine.parse_backend(asked.backend, engine.ENGINES), sources, queries, features)
     systems = None if asked.batch is None else geometry.check_batch(asked.batch, sources, queries)
-    ordered = has_order(engine, platform_of(sources), sources.shape[0], queries is None and radii is None)
-    static_reach = reach if engine.static_radius else None
+    ordered = engine.has_order(chosen, engine.platform_of(sources), sources.shape[0], queries is None and radii is None)
+    static_reach = reach if chosen.static_radius else None
     if box is not None and box.fractional:
-        sources, queries = real_points(sources, queries, box, systems, engine.native)
-    options = Options(keep, engine, closed, 0.0 if radii is None else skin, images, static_reach, ordered)
+        sources, queries = real_points(sources, queries, box, systems, chosen.native)
+    options = engine.Options(keep, chosen, closed, 0.0 if radii is None else skin, images, static_reach, ordered)
     shape = {"own_queries": queries is not None, "masked": active is not None, "source_count": sources.shape[0]}
     problem = Problem(options, radius, skin, **shape, dim=sources.shape[1], dtype=dtype)
     box = None if box is None or images is None else geometry.box_of_list(geometry.round_box(box, dtype), images, reach)
@@ -251,17 +234,19 @@ def round_capacity(slots: int) -> int:
     return -(-slots // _CAPACITY_STEP) * _CAPACITY_STEP
 
 
-def count_capacity(inputs: Inputs, options: Options, slack: Real) -> int:
+def count_capacity(inputs: engine.Inputs, options: engine.Options, slack: Real) -> int:
     """Count the neighbors of concrete positions; return a capacity of `slack` times the longest row."""
     with at_once(), own_transfers():
-        known = count_few(inputs, options)
-        longest = int(count_rows(inputs, options=options)[1]) if known is None else int(known.max())
+        known = engine.count_few(inputs, options)
+        longest = int(engine.count_rows(inputs, options=options)[1]) if known is None else int(known.max())
     wanted = math.ceil(max(longest, 1) * slack)
     return min(round_capacity(wanted), max(wanted, inputs.sources.shape[0]))
 
 
 @functools.partial(compile_program, static_argnames=("options", "room", "moving", "reversing", "flat"))
-def find_fields(inputs: Inputs, options: Options, room: int, moving: bool, reversing: bool, flat: bool) -> dict[str, Any]:
+def find_fields(
+    inputs: engine.Inputs, options: engine.Options, room: int, moving: bool, reversing: bool, flat: bool
+) -> dict[str, Any]:
     """Search, and return the list's fields that come from data: the compiled program of `search` and, if `flat`, `search_edges`.
 
     `room` is the capacity or the total, `moving` says that the list has a skin, `reversing` that it keeps where pairs stand the
@@ -269,12 +254,12 @@ def find_fields(inputs: Inputs, options: Options, room: int, moving: bool, rever
 
     As results of one program, they share no memory with the caller's arrays or each other, so either may be donated.
     """
-    offsets, found = list_flat(inputs, options, room) if flat else (None, find_rows(inputs, options, room))
+    offsets, found = engine.list_flat(inputs, options, room) if flat else (None, engine.find_rows(inputs, options, room))
     rows, n, verlet, reverse = found.rows, len(inputs.sources), None, None
     images = None if found.images is None or found.turns is None else ImageCodes(found.images, found.turns[0], found.turns[1])
     radii = lax.stop_gradient(inputs.cutoff) if isinstance(inputs.cutoff, geometry.Radii) else None
     if moving:
-        sources = hide_inactive(inputs.sources, take_present(inputs).active)
+        sources = engine.hide_inactive(inputs.sources, engine.take_present(inputs).active)
         verlet = first_verlet(sources, inputs.queries, inputs.box, options.images, radii, inputs.batch)
     if reversing and rows.idx is not None and flat:
         reverse = find_reverse(rows.idx[:, None], None, 1, n, False, options.engine.native)

@@ -78,17 +78,13 @@ def has_moved_too_far(
             moved = moved | ((verlet.radii.table > 0) != (radii.table > 0)).any()
         for before, now in given:
             if before is not None and now is not None:
-                moved = moved | (geometry.is_radius(before) != geometry.is_radius(now)).any()
-                grown = jnp.maximum(grown, _growth(before, now))
+                was, stays = geometry.is_radius(before), geometry.is_radius(now)
+                moved = moved | (was != stays).any()
+                most = jnp.max(jnp.where(was & stays, now - before, 0), initial=0)
+                grown = jnp.maximum(grown, most * (1 + 4 * jnp.finfo(most.dtype).eps))
     if box is not None or radii is not None:
         half = geometry.widen(half, (used + grown) / 4)
     return moved | ~(extremes[0] < half.inside)  # `inside` has a margin of 8 eps, so what is below is surely closer
-
-
-def _growth(before: Array, now: Array) -> Array:
-    """Return an upper bound on the growth of a cutoff."""
-    grown = jnp.where(geometry.is_radius(before) & geometry.is_radius(now), now - before, 0)
-    return jnp.max(grown, initial=0) * (1 + 4 * jnp.finfo(grown.dtype).eps)
 
 
 def _find_extremes(before: Array, now: Array, lattice: geometry.Lattice | None, half_skin: geometry.Cutoff) -> Array:

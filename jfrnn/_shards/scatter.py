@@ -61,7 +61,8 @@ def scatter(
     if len(x) > _MOST:
         raise ValueError(f"positions hold {len(x)} particles, but ids are int32: at most {_MOST}.")
     values = jax.tree_util.tree_map_with_path(lambda path, leaf: _check_value(path, leaf, len(x)), values)
-    slack, reach = check_slack(slack), _check_reach(cutoff, skin, x.dtype)
+    slack, radius = check_slack(slack), check_cutoff(cutoff, x.dtype)
+    reach = list_radius(radius, check_skin(skin, radius, x.dtype), x.dtype)
     mesh, cut = _check_mesh(mesh, x.shape[1]), _check_along(along, x, mesh)
     fixed = None if box is None else _check_box(box, x, reach, mesh)
     return _settle(_in_blocks(x, values, fixed, mesh, cut, reach), slack)
@@ -129,11 +130,6 @@ def _check_value(path: KeyPath, leaf: Given, total: int) -> np.ndarray:
     if tuple(leaf.shape[:1]) != (total,):
         raise ValueError(f"{name} must have shape [{total}, ...], one row per particle, got {list(leaf.shape)}.")
     return np.asarray(leaf)
-
-
-def _check_reach(cutoff: Given, skin: object, dtype: np.dtype) -> float:
-    radius = check_cutoff(cutoff, dtype)
-    return list_radius(radius, check_skin(skin, radius, dtype), dtype)
 
 
 def _check_mesh(mesh: object, dim: int) -> Mesh:

@@ -15,21 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jfrnn._engine import (
-    MOST_IN_BOX,
-    PLATFORMS,
-    FoundSums,
-    Inputs,
-    KeptList,
-    Options,
-    Search,
-    Summed,
-    as_float,
-    kept_sums,
-    level_of_caller,
-    pair_sums,
-    prepare_search,
-)
+from jfrnn import _engine as engine
 from jfrnn._geometry import unpack_turns
 from jfrnn._search import kept_shifts
 from jfrnn._sums.scalars import NoTranslationError, hash_of
@@ -53,28 +39,28 @@ class Plan(NamedTuple):
     key: str
 
 
-def refusal(inputs: Inputs, platform: str) -> str | None:
+def refusal(inputs: engine.Inputs, platform: str) -> str | None:
     """Return why this engine cannot run on such a search, or None if it can."""
-    if platform not in PLATFORMS:
+    if platform not in engine.PLATFORMS:
         return f"on the platform {platform!r}, only on the CPU and on CUDA"
-    if platform != "cpu" and inputs.box is not None and inputs.sources.shape[0] >= MOST_IN_BOX:
-        return f"of more than {MOST_IN_BOX - 1} positions in a periodic box on the platform {platform!r}"
+    if platform != "cpu" and inputs.box is not None and inputs.sources.shape[0] >= engine.MOST_IN_BOX:
+        return f"of more than {engine.MOST_IN_BOX - 1} positions in a periodic box on the platform {platform!r}"
     return None
 
 
-def is_fused(inputs: Inputs, options: Options, term: Term) -> bool:
+def is_fused(inputs: engine.Inputs, options: engine.Options, term: Term) -> bool:
     """Say whether this engine computes a sum: it was chosen by name, or by "auto" and supports the term."""
     if not options.engine.translates:
         return False
     return not options.may_change or can_sum(inputs, term)
 
 
-def can_sum(inputs: Inputs, term: Term) -> bool:
+def can_sum(inputs: engine.Inputs, term: Term) -> bool:
     """Say whether this engine supports a term."""
     return _why_not(term, *_kind(inputs)) is None
 
 
-def check(inputs: Inputs, options: Options, term: Term) -> None:
+def check(inputs: engine.Inputs, options: engine.Options, term: Term) -> None:
     """Raise if this engine was chosen by name and does not support the term; warn if "auto" falls back to a slower one.
 
     Raises:
@@ -90,27 +76,29 @@ def check(inputs: Inputs, options: Options, term: Term) -> None:
         raise reason
     if isinstance(reason, NoTranslationError):
         warnings.warn(
-            f"backend='auto' takes the slower engine 'jax' for a pair sum: {reason}", RuntimeWarning, stacklevel=level_of_caller()
+            f"backend='auto' takes the slower engine 'jax' for a pair sum: {reason}",
+            RuntimeWarning,
+            stacklevel=engine.level_of_caller(),
         )
 
 
-def can_sum_list(given: KeptList, term: Term) -> bool:
+def can_sum_list(given: engine.KeptList, term: Term) -> bool:
     """Say whether a term is summed over a list by this engine; warn if it has no translation."""
     reason = _why_not(term, *_kind_of_list(given))
     if isinstance(reason, NoTranslationError):
         warnings.warn(
-            f"a pair sum over a list takes the slower engine 'jax': {reason}", RuntimeWarning, stacklevel=level_of_caller()
+            f"a pair sum over a list takes the slower engine 'jax': {reason}", RuntimeWarning, stacklevel=engine.level_of_caller()
         )
     return reason is None
 
 
-def _kind_of_list(given: KeptList) -> tuple[np.dtype, tuple[bool, ...]]:
+def _kind_of_list(given: engine.KeptList) -> tuple[np.dtype, tuple[bool, ...]]:
     lattice = given.lattice
     periodic = (False,) * given.sources.shape[1] if lattice is None else lattice.images.periodic
     return np.dtype(given.sources.dtype), periodic
 
 
-def _kind(inputs: Inputs) -> tuple[np.dtype, tuple[bool, ...]]:
+def _kind(inputs: engine.Inputs) -> tuple[np.dtype, tuple[bool, ...]]:
     """Return what a translation depends on besides its term: the dtype of the positions and the periodic axes."""
     return np.dtype(inputs.sources.dtype), (False,) * inputs.sources.shape[1] if inputs.box is None else inputs.box.periodic
 
@@ -168,11 +156,11 @@ def make_plan(term: Term, dtype: np.dtype, periodic: tuple[bool, ...], negated: 
         for k, (spec, total, mark) in enumerate(zip(translated.outputs, term.totals, term.marks, strict=True))
         for e in range(math.prod(spec.shape))
     )
-    first = 0 if listed else _first_of(term)
+    sizes = [math.prod(like.shape) for like, total in zip(term.summands, term.totals, strict=True) if not total]
+    first = sizes[0] if not listed and 0 < sum(sizes[:1]) < sum(sizes) else 0  # sums that stand apart: nothing has to be cut out
     text = TermText(translated.text, steps, values[0], values[1], values[2], sums, first, translated.unshifted)
-    turns = [
-        ((len(group), 0),) if steps and not listed else () for group in term.operands
-    ]  # the columns of turns follow those of the operands
+    # the columns of turns follow those of the operands
+    turns = [((len(group), 0),) if steps and not listed else () for group in term.operands]
     return Plan(text, columns[0], columns[1] + turns[1], columns[2] + turns[2], hash_of(tuple(text), dtype.name)[:20])
 
 
@@ -187,33 +175,29 @@ def _ends(term: Term) -> Ends | None:
     return Ends(0, found[0], found[1], range(1, 1 + len(term.operands.shared)))
 
 
-def _first_of(term: Term) -> int:
-    """Return how many of several sums of each i stand apart, so that nothing has to be cut out: those of the first summand."""
-    sizes = [math.prod(like.shape) for like, total in zip(term.summands, term.totals, strict=True) if not total]
-    return sizes[0] if 0 < sum(sizes[:1]) < sum(sizes) else 0
-
-
-def sums(inputs: Inputs, options: Options, term: Term, operands: Groups, compensated: bool) -> list[Array]:
+def sums(inputs: engine.Inputs, options: engine.Options, term: Term, operands: Groups, compensated: bool) -> list[Array]:
     """Sum a term over all pairs of a search, as `jfrnn._sums.relations.sum_pairs` specifies."""
     plan = make_plan(term, *_kind(inputs))
-    found, totals, _ = _launch(prepare_search(inputs, options), options, plan, operands, compensated)
+    found, totals, _ = _launch(engine.prepare_search(inputs, options), options, plan, operands, compensated)
     return _unpack(term, found, totals)
 
 
-def sums_of_list(given: KeptList, term: Term, operands: Groups, compensated: bool, apart: bool) -> list[Array]:
+def sums_of_list(given: engine.KeptList, term: Term, operands: Groups, compensated: bool, apart: bool) -> list[Array]:
     """Sum a term over the pairs of a list; with `given.reversal` over those of its sources."""
     plan = make_plan(term, *_kind_of_list(given), listed=True)
-    found, totals, _ = kept_sums(
-        given, Summed(plan.text, plan.key, compensated), _values_of_list(given, plan, term, operands), apart
+    found, totals, _ = engine.kept_sums(
+        given, engine.Summed(plan.text, plan.key, compensated), _values_of_list(given, plan, term, operands), apart
     )
     return _unpack(term, found, totals)
 
 
-def extremes_of_list(given: KeptList, term: Term, operands: Groups, largest: bool) -> list[tuple[Array, Array, Array | None]]:
+def extremes_of_list(
+    given: engine.KeptList, term: Term, operands: Groups, largest: bool
+) -> list[tuple[Array, Array, Array | None]]:
     """Find the largest summands over the pairs of a list, as `extremes` does over those of a search."""
     plan = make_plan(term, *_kind_of_list(given), not largest, listed=True)
     values = _values_of_list(given, plan, term, operands)
-    (found,), _, which = kept_sums(given, Summed(plan.text, plan.key, extremes=True), values)
+    (found,), _, which = engine.kept_sums(given, engine.Summed(plan.text, plan.key, extremes=True), values)
     source, place, shifts = which[..., 0], which[..., 1], None
     if given.lattice is not None:
         codes = None if given.codes is None else jnp.take_along_axis(given.codes, place, axis=1)
@@ -221,7 +205,7 @@ def extremes_of_list(given: KeptList, term: Term, operands: Groups, largest: boo
     return _split_extremes(term, found, source, shifts)
 
 
-def _values_of_list(given: KeptList, plan: Plan, term: Term, operands: Groups) -> tuple[Array, Array | None, Array]:
+def _values_of_list(given: engine.KeptList, plan: Plan, term: Term, operands: Groups) -> tuple[Array, Array | None, Array]:
     """Return the columns of what all pairs share, of i, and of j; None for i where those are of the same arrays."""
     n, m = (len(x) for x in (given.sources, given.rows)[:: 1 if given.reversal is None else -1])
     of_i, of_j = (
@@ -233,7 +217,7 @@ def _values_of_list(given: KeptList, plan: Plan, term: Term, operands: Groups) -
 
 
 def extremes(
-    inputs: Inputs, options: Options, term: Term, operands: Groups, largest: bool
+    inputs: engine.Inputs, options: engine.Options, term: Term, operands: Groups, largest: bool
 ) -> list[tuple[Array, Array, Array | None]]:
     """Find the largest summands (or the negatives of the smallest) over all pairs of a search.
 
@@ -242,7 +226,7 @@ def extremes(
             in a box their lattice shifts [rows, elements, d]. Of equal values, that of the smallest source is chosen, of its images
             any.
     """
-    search = prepare_search(inputs, options)
+    search = engine.prepare_search(inputs, options)
     (values,), _, which = _launch(search, options, make_plan(term, *_kind(inputs), not largest), operands, False, extremes=True)
     source, shifts = which[..., 0], None
     if search.torus is not None:
@@ -260,7 +244,9 @@ def _split_extremes(term: Term, values: Array, source: Array, shifts: Array | No
     return list(zip(*parts[:3], strict=True))
 
 
-def _launch(search: Search, options: Options, plan: Plan, operands: Groups, compensated: bool, extremes: bool = False) -> FoundSums:
+def _launch(
+    search: engine.Search, options: engine.Options, plan: Plan, operands: Groups, compensated: bool, extremes: bool = False
+) -> engine.FoundSums:
     """Run the kernel for a prepared search with the operands that a plan needs."""
     sources, torus = search.sources, search.torus
     if torus is not None:
@@ -270,7 +256,7 @@ def _launch(search: Search, options: Options, plan: Plan, operands: Groups, comp
     columns = plan.shared, plan.own, plan.others
     shared, own, others = (_pack(*group, sources.dtype) for group in zip(operands, columns, sizes, strict=True))
     values = shared, own, others
-    return pair_sums(search, options.filter, Summed(plan.text, plan.key, compensated, extremes), values)
+    return engine.pair_sums(search, options.filter, engine.Summed(plan.text, plan.key, compensated, extremes), values)
 
 
 def _pack(group: tuple, columns: _Columns, size: int | None, dtype: np.dtype) -> Array:
@@ -278,7 +264,7 @@ def _pack(group: tuple, columns: _Columns, size: int | None, dtype: np.dtype) ->
     if not columns:
         return jnp.zeros(1 if size is None else (1, 1), dtype)
     leading = () if size is None else (size,)
-    flat = [as_float(jnp.reshape(x, (*leading, -1)), dtype) for x in group]
+    flat = [engine.as_float(jnp.reshape(x, (*leading, -1)), dtype) for x in group]
     return jnp.concatenate([flat[k][..., e : e + 1] for k, e in columns], axis=-1)
 
 

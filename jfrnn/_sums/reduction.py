@@ -18,7 +18,7 @@ from jfrnn._sums.extremes import bind_extremes
 from jfrnn._sums.pair_function import call_with_pair
 from jfrnn._sums.relations import Flat, Kept, Listed, Relation, Searched
 from jfrnn._sums.summation import bind_sum
-from jfrnn._sums.terms import OF_QUERIES, OF_SOURCES, Groups, Labels, Summand, Term, choose, fresh_labels, trace
+from jfrnn._sums.terms import OF_QUERIES, OF_SOURCES, Groups, Summand, Term, choose, fresh_labels, trace
 from jfrnn._tracing import Given, Points, Tree, call_apart, compile_program, on_device
 
 
@@ -204,7 +204,10 @@ def reduce_pairs(
         *(tuple(jax.ShapeDtypeStruct(x.shape[1:], x.dtype) for x in group) for group in operands[1:]),
     )
     shift = jax.ShapeDtypeStruct(pairs.sources.shape[1:], pairs.sources.dtype)
-    labels = _labels(operands, pairs.rows is pairs.sources and mine is theirs)
+    theirs_first = OF_SOURCES, *fresh_labels(len(operands.others) - 1, ((), ()))
+    labels = theirs_first, theirs_first  # where both sides are the same arrays
+    if pairs.rows is not pairs.sources or mine is not theirs:
+        labels = (OF_QUERIES, *fresh_labels(len(operands.own) - 1, ((), theirs_first))), theirs_first
     term, needed, closed_over = trace(summand, one_pair, shift, labels, fn, pairs.mark is None)
     if reduce != "sum" and not all(jnp.issubdtype(x.dtype, jnp.floating) for x in term.summands):
         raise TypeError(f"fn must return floats for reduce={reduce!r}, whose rows may be infinite: convert them with .astype.")
@@ -284,14 +287,6 @@ def _along_first_axis(largest: np.floating | Array, dim: int, dtype: np.dtype) -
     vector = np.zeros(dim, dtype)
     vector[0] = np.asarray(largest, dtype) / 2
     return on_device(vector)
-
-
-def _labels(operands: Groups, same: bool) -> Labels:
-    """Label the operands of i and of j, positions first; `same` says that both sides are the same arrays."""
-    theirs = OF_SOURCES, *fresh_labels(len(operands.others) - 1, ((), ()))
-    if same:
-        return theirs, theirs
-    return (OF_QUERIES, *fresh_labels(len(operands.own) - 1, ((), theirs))), theirs
 
 
 def _is_backward(shift: Array) -> Array:

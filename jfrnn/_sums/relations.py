@@ -93,7 +93,7 @@ class _OfList:
     @property
     def sizes(self) -> tuple[int, int]:
         """Number of rows and of sources; exchanged if flipped."""
-        m, n = self._row_count, self.source_count
+        m, n = self._extent[0], self.source_count
         return (n, m) if self.flipped else (m, n)
 
     def reverse(self) -> Self:
@@ -108,7 +108,8 @@ class _OfList:
 
     def fold(self, elements: int, visit: Visit, out: Tree) -> Tree:
         """Visit all pairs in blocks of rows, as `fold_neighbors` does."""
-        m, group = self._row_count, min(FOLD_GROUP, self._widest)
+        m, widest = self._extent
+        group = min(FOLD_GROUP, widest)
         if 0 in (m, group, self.source_count):
             return out
         size = min(max(_LIST_SLOTS // (group * elements), 1), m)
@@ -132,12 +133,8 @@ class _OfList:
         return lax.fori_loop(0, -(-m // size), fold_block, out)
 
     @property
-    def _row_count(self) -> int:
-        raise NotImplementedError
-
-    @property
-    def _widest(self) -> int:
-        """The most pairs that a row may have."""
+    def _extent(self) -> tuple[int, int]:
+        """The number of rows, and the most pairs that one may have."""
         raise NotImplementedError
 
     def _longest(self, rows: Array) -> Array | int:
@@ -165,18 +162,14 @@ class Listed(_OfList):
     idx: Array
 
     @property
-    def _row_count(self) -> int:
-        return self.idx.shape[0]
-
-    @property
-    def _widest(self) -> int:
-        return self.idx.shape[1]
+    def _extent(self) -> tuple[int, int]:
+        return self.idx.shape[0], self.idx.shape[1]
 
     def _longest(self, rows: Array) -> int:
-        return self._widest
+        return self.idx.shape[1]
 
     def _slots(self, rows: Array, start: Array, group: int) -> tuple[Array, Array | None, Array]:
-        first = jnp.minimum(start, self._widest - group).astype(rows.dtype)
+        first = jnp.minimum(start, self.idx.shape[1] - group).astype(rows.dtype)
         new = first + lax.iota(jnp.int32, group) >= start
 
         def cut(x: Array) -> Array:
@@ -205,20 +198,16 @@ class Flat(_OfList):
     offsets: Array
 
     @property
-    def _row_count(self) -> int:
-        return self.offsets.shape[0] - 1
-
-    @property
-    def _widest(self) -> int:
-        return self.senders.shape[0]
+    def _extent(self) -> tuple[int, int]:
+        return self.offsets.shape[0] - 1, self.senders.shape[0]
 
     def _longest(self, rows: Array) -> Array:
-        ends = jnp.minimum(self.offsets, self._widest)
+        ends = jnp.minimum(self.offsets, self.senders.shape[0])
         return largest_of(ends[rows + 1] - ends[rows])
 
     def _slots(self, rows: Array, start: Array, group: int) -> tuple[Array, Array | None, Array]:
         edge = self.offsets[rows, None] + (start + lax.iota(jnp.int32, group))
-        there = edge < jnp.minimum(self.offsets[rows + 1, None], self._widest)
+        there = edge < jnp.minimum(self.offsets[rows + 1, None], self.senders.shape[0])
         edge = jnp.where(there, edge, 0)
         return self.senders[edge], None if self.shifts is None else self.shifts[edge], self.mask[edge] & there
 

@@ -42,9 +42,8 @@ def _bind(leaves: list[Array], operands: Groups, term: Term, structure: Structur
     if isinstance(relation, Searched):
         check(relation.inputs, relation.options, term)
     elif isinstance(relation, Kept) and not can_sum_list(relation.given, term):
-        leaves, structure = jax.tree.flatten(
-            tracing.call_apart(Kept.listed, relation)
-        )  # once: derivatives are summed in the same way
+        relation = tracing.call_apart(Kept.listed, relation)  # once: derivatives are summed in the same way
+        leaves, structure = jax.tree.flatten(relation)
     axes = tracing.varying_axes((leaves, flat))
     leaves, flat = tracing.vary((leaves, flat), axes)
     return _pair_sum_p.bind(*leaves, *flat, term=term, structure=structure, compensated=compensated)

@@ -129,7 +129,8 @@ def _held_cells(corners: Array, cutoff: Cutoff) -> tuple[Array, Array, list[Arra
 
     def try_level(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         level, _, undecided = state
-        held, complete = _cells_at(level, corners, low, high, radius)
+        cells, there, complete = _box_cells(level, low, high)
+        held = there & ~_is_apart(cells, corners, scale_of(level, np.dtype(corners.dtype)), radius) & complete[:, None]
         too_many = undecided & (~complete | (jnp.sum(held, axis=1, dtype=jnp.int32) > MOST_CELLS[dim])) & (level > 0)
         return level - too_many.astype(jnp.int32), held, too_many
 
@@ -151,13 +152,6 @@ def _exponent(x: Array) -> Array:
     """Return the biased exponent of floats >= 0, int32; for infinity that of the largest float."""
     unsigned, nmant, most = (jnp.uint32, 23, 0xFE) if x.dtype == jnp.float32 else (jnp.uint64, 52, 0x7FE)
     return jnp.minimum((lax.bitcast_convert_type(x, unsigned) >> unsigned(nmant)).astype(jnp.int32), most)
-
-
-def _cells_at(level: Array, corners: Array, low: Array, high: Array, radius: Array) -> tuple[Array, Array]:
-    """Return which of [b, lanes] cells each triangle needs, and whether these lanes cover its whole box, [b] bool."""
-    cells, there, complete = _box_cells(level, low, high)
-    apart = _is_apart(cells, corners, scale_of(level, np.dtype(corners.dtype)), radius)
-    return there & ~apart & complete[:, None], complete
 
 
 def _box_cells(level: Array, low: Array, high: Array) -> tuple[list[Array], Array, Array]:

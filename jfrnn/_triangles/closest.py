@@ -235,15 +235,10 @@ def are_contacts(mask: Array, triangle: Array, faces: Array, seen: Array, vector
 
     def drop_yielding(j: Array, left: Array) -> Array:
         one = _Slots(*(lax.dynamic_slice_in_dim(x, j, 1, axis=1) for x in slots))
-        return left & ~(one.mask & _is_first(one, slots) & (_holds(one, slots) | _is_same(one, slots)))
+        start, end = (jnp.any(one.named == x[..., None], axis=2) for x in (slots.start, slots.end))  # it has their side or corner
+        return left & ~(one.mask & _is_first(one, slots) & (start & end | _is_same(one, slots)))
 
     return lax.fori_loop(0, longest, drop_yielding, mask)
-
-
-def _holds(one: _Slots, others: _Slots) -> Array:
-    """Say whether the triangle of one slot per row (k = 1) has the corners or sides on which the nearest points of others lie."""
-    start, end = (jnp.any(one.named == x[..., None], axis=2) for x in (others.start, others.end))
-    return start & end
 
 
 def _is_same(one: _Slots, others: _Slots) -> Array:

@@ -77,7 +77,8 @@ def limb_counts(dtype: np.dtype) -> tuple[int, int]:
 def bit_range(numbers: Array) -> tuple[Array, Array]:
     """Return the position of the lowest set bit in any number [m, k] of a pair, and the number of bits to the highest: [k]."""
     _, place, mantissa = fields_of(numbers)
-    lowest = place + _trailing_zeros(mantissa)
+    one = np.ones((), mantissa.dtype)
+    lowest = place + lax.population_count((mantissa & (~mantissa + one)) - one).astype(jnp.int32)
     highest = place + 8 * mantissa.dtype.itemsize - lax.clz(mantissa).astype(jnp.int32)
     zero = mantissa == 0
     origin = jnp.min(jnp.where(zero, _NONE, lowest), axis=0)
@@ -134,7 +135,8 @@ def is_crossed(segments: Segments, origin: Array, count: int) -> Array:
 
 def _near_segment(vectors: Array) -> Array:
     x, along, radius = vectors[:4].reshape(2, 2, *vectors.shape[1:]), vectors[4:6], vectors[-2:-1]
-    sums = _dots([(x[0], x[0]), (x[1], x[1]), (x[0], along), (along, along)])
+    left, right = jnp.stack([x[0], x[1], x[0], along]), jnp.stack([x[0], x[1], along, along])
+    sums = _product(left, right).sum(axis=1, dtype=left.dtype)  # scalar products
     limit = _product(radius, radius)
     square = jnp.stack([sums[0], sums[1]]) - limit
     place, length = -sums[2:3], sums[3:]
@@ -230,17 +232,6 @@ def _product(a: Array, b: Array) -> Array:
         return lax.dynamic_update_slice_in_dim(total, window + more, GUARDS + i, axis=-1)
 
     return lax.fori_loop(0, a.shape[-1], add_moved, jnp.zeros((*shape, GUARDS + a.shape[-1] + width), a.dtype))
-
-
-def _trailing_zeros(word: Array) -> Array:
-    one = np.ones((), word.dtype)
-    return lax.population_count((word & (~word + one)) - one).astype(jnp.int32)
-
-
-def _dots(pairs: list[tuple[Array, Array]]) -> Array:
-    """Return scalar products of pairs of vectors [axis, k, limbs]: [pairs, k, limbs]."""
-    left, right = (jnp.stack(vectors) for vectors in zip(*pairs, strict=True))
-    return _product(left, right).sum(axis=1, dtype=left.dtype)
 
 
 def _split(rows: Array, *sizes: int) -> list[Array]:

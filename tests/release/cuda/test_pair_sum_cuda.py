@@ -175,7 +175,7 @@ def test_auto_takes_the_kernel_on_cuda_and_jax_elsewhere(monkeypatch):
 
 def test_a_box_holds_as_many_particles_as_their_numbers_leave_room_for(monkeypatch):
     """An image's code takes bits of the number; on the CPU it does not."""
-    monkeypatch.setattr(_fused, "MOST_IN_BOX", 4)
+    monkeypatch.setattr(_fused.engine, "MOST_IN_BOX", 4)
     x, box = np.zeros((4, 3), np.float32), jfrnn.Box([4.0] * 3)
     _, inputs = check_problem(Asked(x, 1.0, box=box, backend="warp"))
     assert _fused.refusal(inputs, "cpu") is None
