@@ -218,11 +218,14 @@ class KeptSearch(KeptOptions):
         active = self._check_active(active, sources)
         if any(isinstance(x, Tracer) for x in jax.tree.leaves((sources, rows, active, box, radii, self.required))):
             raise TypeError("grow() changes the shape of the list and cannot run inside jax.jit: call it on what jit returns.")
-        images = self._grow_images(box, radii)
+        images, reach = self.box_kind, self.problem.reach(radii)
+        if box is not None and self.box is not None and images is not None:
+            short = bool(np.any(np.asarray(jax.device_get(self.status)) & geometry.Status.BOX_TOO_SMALL.value))
+            images = geometry.grow_images(images, (box, self.box), reach, self.dtype, self.source_count, short)
         options = self.problem.options._replace(images=images)
         wider = _replace(self, problem=dataclasses.replace(self.problem, options=options))
         if box is not None and images is not None:
-            box = geometry.box_of_list(box, images, self.problem.reach(radii))
+            box = geometry.box_of_list(box, images, reach)
         inputs = self.problem.inputs(sources, rows, active, box, radii, self.batch, self.exclude)
         with own_transfers():
             met = self._round_room(math.ceil(slack * int(np.max(np.asarray(self.required)))))
@@ -247,23 +250,6 @@ class KeptSearch(KeptOptions):
         if radii is None:
             raise ValueError("this list was made with a cutoff for each particle: pass such an array, or leave cutoff out.")
         return dataclasses.replace(radii, itself=self.radii.itself)
-
-    def _box_now(self, box: geometry.Box | None, sources: Array) -> geometry.Box | None:
-        if box is None:
-            return self.box
-        if self.box is None:
-            raise ValueError("this list was made without a periodic box: leave box out.")
-        checked = geometry.check_box(box, sources, like=self.box)
-        if checked is None:
-            return None
-        return geometry.round_box(checked.counted_as(self.box).of_list(self.box.images_of_list), np.dtype(sources.dtype))
-
-    def _grow_images(self, box: geometry.Box | None, radii: geometry.Radii | None) -> geometry.Images | None:
-        if self.box_kind is None or self.box is None or box is None:
-            return self.box_kind
-        short = bool(np.any(np.asarray(jax.device_get(self.status)) & geometry.Status.BOX_TOO_SMALL.value))
-        reach = self.problem.reach(radii)
-        return geometry.grow_images(self.box_kind, (box, self.box), reach, self.dtype, self.source_count, short)
 
     def _present(
         self, topology: Topology, count: Array, sources: Array, rows: Array, box: geometry.Box | None, decided: bool = False
@@ -292,7 +278,12 @@ class KeptSearch(KeptOptions):
         if queries is not None:
             rows = geometry.check_again("queries", queries, problem.dtype, problem.dim, self._row_count)
             geometry.check_devices("queries", rows, self.status)
-        box = self._box_now(box, sources)
+        if box is None:
+            box = self.box
+        elif self.box is None:
+            raise ValueError("this list was made without a periodic box: leave box out.")
+        elif (box := geometry.check_box(box, sources, like=self.box)) is not None:
+            box = geometry.round_box(box.counted_as(self.box).of_list(self.box.images_of_list), problem.dtype)
         if box is not None and box.fractional:
             sources, rows = real_points(sources, rows, box, self.batch, problem.options.engine.native)
         return sources, sources if rows is None else rows, box

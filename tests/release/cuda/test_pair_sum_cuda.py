@@ -195,8 +195,8 @@ def test_programs_for_cuda_call_it_and_plans_have_the_arguments_of_their_kernels
     assert f'"jfrnn_sorting_cuda_3d_f32_own{"_nearest" * periodic}@' in program
     kind = Kind(3, False, own=True, drop_self=True, periodic=periodic)
     given = {name: (40, 3) for name in warp_sums._GIVEN}
-    sorting = warp_sums._plan_sorting(kind, given, 132)
-    summing = warp_sums._plan_on_cuda(kind, plan.text, plan.key, given, 132)
+    sorting = warp_sums._sorting_callable(kind).args[0].plan(given, 132)
+    summing = warp_sums._cuda_callable(kind, plan.text, plan.key).args[0].plan(given, 132)
     assert (len(sorting.steps), len(summing.steps)) == (6, 2 + periodic)
     assert [step.beside for step in summing.steps] == [False] * (1 + periodic) + [bool(periodic)]
     words = {"info", "scratch"}
@@ -237,9 +237,9 @@ def test_cutoffs_that_differ_compile_and_plans_have_the_arguments_of_their_kerne
         kind = Kind(3, False, scaled=True, own=True, drop_self=True, rule=rule, tree=True)
         names = (*warp_sums._GIVEN, *names_of_tree(rule), *SUMS, "values", "info", "scratch")
         shapes = {name: (n, 4) for name in names}
-        found = warp_sums._plan_sorting(kind, shapes, 132)
+        found = warp_sums._sorting_callable(kind).args[0].plan(shapes, 132)
         assert [getattr(step, "threads", 0) for step in found.steps] == [0, 0, 64, 32]  # two leaves, and a root
-        summing = warp_sums._plan_on_cuda(kind, plan.text, plan.key, shapes, 132)
+        summing = warp_sums._cuda_callable(kind, plan.text, plan.key).args[0].plan(shapes, 132)
         numbers = {**found.numbers, **summing.numbers, "level": 1}
         found = summing._replace(steps=[*found.steps[-1:], *summing.steps], numbers=numbers)
     for launch in found.steps:
@@ -252,7 +252,7 @@ def test_few_particles_take_one_launch():
     x = jnp.zeros((40, 3), np.float32)
     plan = plan_of(lambda x: jfrnn.pair_sum(poly6, x, CUTOFF, x[:, 0], backend="warp"), x)
     kind = Kind(3, False, own=True, drop_self=True)
-    found = warp_sums._plan_few(kind, plan.text, plan.key, {name: (40, 3) for name in warp_sums._GIVEN}, 132)
+    found = warp_sums._few_callable(kind, plan.text, plan.key).args[0].plan({name: (40, 3) for name in warp_sums._GIVEN}, 132)
     (launch,) = found.steps
     assert launch.threads // launch.kernel.block == few_cuda.blocks(40) == 5
     assert [few_cuda.blocks(m) * few_cuda.warps(m) for m in (1, 41, 1025, 4095)] == [8, 48, 1040, 4096]  # everyone is served
