@@ -12,7 +12,16 @@ from jfrnn._engine.operands import cutoffs_of_particles, excluded_rows, orders_f
 from jfrnn._engine.plans import Launch, Plan, share
 from jfrnn._engine.problem import Filter, Search
 from jfrnn._engine.sum_results import FoundSums, Summed, SumsOf, TermText, beside_rows, numbers_of_values
-from jfrnn._engine.variants import SUMS, describe_sums, kind_of_search, names_of_tree, scalar_of, size_numbers, sort_on_cpu
+from jfrnn._engine.variants import (
+    SUMS,
+    describe_sums,
+    kind_of_search,
+    names_of_cutoffs,
+    names_of_tree,
+    scalar_of,
+    size_numbers,
+    sort_on_cpu,
+)
 from jfrnn._engine.warp import QUERIES_PER_THREAD, are_few, by_cells_or_tree, fit_tree, place_launches
 from jfrnn._geometry import Cutoffs
 from jfrnn._tracing import on_platform
@@ -42,10 +51,11 @@ def pair_sums(search: Search, keep: Filter, summed: Summed, values: tuple[Array,
                 return _sum_on_cpu(kind, term, key, pack_particles(search), [*beside_rows(term, values), *more])
             if not kind.rule and are_few(search):
                 return _sum_few(kind, term, key, [*pack_particles(search), *values, *more])
-            orders = [*of_particles.values(), *orders_for_tree(search).values()] if tree else []
-            particles = pack_particles(search)
-            words = sort_particles(kind._replace(tree=tree), particles, orders)
-            return _sum_on_cuda(kind._replace(tree=tree), term, key, particles, [*values, *words, *more])
+            sorted_as, particles = kind._replace(tree=tree), pack_particles(search)
+            given = list(of_particles.values()) if tree or cells_cuda.has_long(sorted_as) else []
+            given += orders_for_tree(search).values() if tree else []
+            words = sort_particles(sorted_as, particles, given)
+            return _sum_on_cuda(sorted_as, term, key, particles, [*values, *words, *more])
 
         return call
 
@@ -72,15 +82,16 @@ def _sum_few(kind: Kind, term: TermText, key: str, given: list[Array]) -> FoundS
     return results.unpack(*_few_callable(kind, term, key)(*given, output_dims=results.dims()))
 
 
-def sort_particles(kind: Kind, particles: Particles, orders: list[Array]) -> Sequence[Array]:
+def sort_particles(kind: Kind, particles: Particles, given: list[Array]) -> Sequence[Array]:
     """Sort particles on CUDA by a call of its own, which XLA makes once for a sum and its derivative; return what it wrote.
 
-    `orders` are what a tree is fitted to.
+    `given` are cutoffs that differ, and the orders that a tree is fitted to.
     """
     n, m = len(particles[0]), len(particles[1])
     words = (tree_cuda if kind.tree else cells_cuda).scratch_words(n, m, kind.dim, 2 if kind.double else 1, kind.own)
-    kind = kind.only("scaled", "own", "periodic", "batched", *(("rule", "tree") if kind.tree else ()))
-    return _sorting_callable(kind)(*particles, *orders, output_dims={"info": 2, "scratch": words})
+    more = ("rule", "tree") if kind.tree or cells_cuda.has_long(kind) else ()
+    kind = kind.only("scaled", "own", "periodic", "batched", *more)
+    return _sorting_callable(kind)(*particles, *given, output_dims={"info": 2, "scratch": words})
 
 
 def _sum_on_cuda(kind: Kind, term: TermText, key: str, particles: Particles, given: list[Array]) -> FoundSums:
@@ -118,7 +129,7 @@ def _plan_few(kind: Kind, term: TermText, key: str, shapes: Shapes, _: int) -> P
 @kernel
 def _sorting_callable(kind: Kind) -> Call:
     """Make a function that XLA calls to sort particles on CUDA."""
-    given = (*_GIVEN[:3], *names_of_tree(kind.rule) * kind.tree)
+    given = (*_GIVEN[:3], *(names_of_tree(kind.rule) if kind.tree else names_of_cutoffs(kind.rule)))
     return Call(f"jfrnn_sorting_cuda_{kind.name}", given, _WORDS, functools.partial(_plan_sorting, kind))
 
 

@@ -42,7 +42,7 @@ JFRNN_FUNCTION void keep(const PairSearch& search, bool is_near, const Place& ca
             if (is_near)
                 search.cutoffs_of(search.source_named(id_of(candidate.id)), &warp.candidates[4][number % RING]);
     }
-    if constexpr (LATER || !HELD)
+    if constexpr (!HELD)
         store_if(is_near, shared_address(warp.candidate_ids) + 4 * (number % RING), (unsigned int)id_of(candidate.id));
     if constexpr (HELD)
         store_if(is_near, shared_address(warp.ids) + 4 * number, (unsigned int)id_of(candidate.id));

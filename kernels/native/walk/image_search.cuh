@@ -34,7 +34,7 @@ JFRNN_FUNCTION void load_if(bool is_loaded, const Place* from, AnyPlace& to) {
 // stands at its place. The code of an image counts shifts along the axes, the last one fastest. An id holds it in the upper bits or,
 // where images are told apart in lists, as lists do.
 struct ImageSearch : Search {
-    // Inside, no row of cells leaves the box, and nothing that is near comes from outside of it: all are at home, nothing is moved.
+    // Inside, no row of cells leaves the box: all that is near is at home, nothing is moved.
     static constexpr bool INSIDE = !CROSSING;
     static constexpr int ID_BITS = 27;
     static constexpr int IDS = (PERIODIC == 1 || SUMS) && INSIDE ? 0 : PERIODIC;  // 0: ids tell no image, 1: in the upper bits
