@@ -115,13 +115,14 @@ JFRNN_FUNCTION unsigned int find_met(const PairSearch& search, const Group& grou
 // Returns which of the neighbors in a block of so many candidates a query does not exclude. Few candidates stand in the row of any query
 // of the group: the others are told apart by one lane each.
 JFRNN_FUNCTION unsigned int drop_excluded(
-    const PairSearch& search, const Group& group, const int* ids, int size, unsigned int hits) {
+    const PairSearch& search, const Group& group, const int* ids, const int* sources, int size, unsigned int hits) {
     const Warp& warp = shared_warp();
     const int lane = search.lane;
-    const bool by_any = lane < size && warp.excluded_by_any.may_have(search.excluded_id(ids[lane]));
+    auto named = [&](int j) { return search.excluded_id(ids[j], NAMED_APART ? sources[j] : search.source_named(ids[j])); };
+    const bool by_any = lane < size && warp.excluded_by_any.may_have(named(lane));
     const int* const kept = warp.excluded[lane];
     for (unsigned int rest = hits & __ballot_sync(ALL, by_any); rest; rest &= rest - 1) {
-        const int j = __ffs(rest) - 1, id = search.excluded_id(ids[j]);
+        const int j = __ffs(rest) - 1, id = named(j);
         bool found =
             kept[0] == Excluded::MANY && Excluded(search.excluded_starts, search.excluded, group.my_id, warp.filters[lane]).has(id);
 #pragma unroll
@@ -189,7 +190,7 @@ JFRNN_FUNCTION void meet_block(
         aside.take_back(candidates, matrix);
     }
     if constexpr (EXCLUDING)
-        hits = drop_excluded(search, group, ids, pairs.kept - pairs.tested, hits);
+        hits = drop_excluded(search, group, ids, warp.candidate_ids + first_candidate, pairs.kept - pairs.tested, hits);
     pairs.found += __popc(hits);
     if constexpr (HELD) {
         warp.hits[pairs.tested / 32][search.lane] = hits;

@@ -141,7 +141,7 @@ struct Walk : PairSearch {
             Place at_home = group.mine;
             if constexpr (PERIODIC == 2 || SUMS)
                 at_home.id = bits_as_real(id_of_image(SUMS ? group.place + lane : group.my_id, home));
-            keep(*this, lane < group.size, at_home, x, lane);
+            keep(*this, lane < group.size, at_home, group.my_id, x, lane);
             pairs.kept = group.size;
         }
     }
