@@ -53,7 +53,7 @@ class Sph(_commands.Commands):
     """What measures and validates the fluid solver; `python -m jfrnn.sph` runs it."""
 
     there = {  # noqa: RUF012
-        name: ("experiments.sph.commands", name, text)
+        name: (f"experiments.sph.{'commands' if name == 'peers' else name}", "peers" if name == "peers" else "command", text)
         for name, text in {
             "validate": "Run fluid scenes with known answers.",
             "speed": "Time steps of a fluid scene.",

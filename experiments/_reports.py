@@ -10,8 +10,7 @@ import typer
 from experiments._rows import RowFile, SearchRow, read_text
 
 _KINDS = (  # columns by which rows are known, the module of their report, and, where they are no dicts, of their kind and its name
-    ({"figures", "curves"}, "sph.validate", ("sph.validate", "CaseRow")),
-    ({"particle_steps_per_s", "way"}, "sph.speed_report", ("sph.speed", "StepRow")),
+    ({"figures", "curves"}, "sph.validate", None),
     ({"compensated", "way"}, "bench.sums_report", ("bench.sums", "SumRow")),
     ({"scaling", "devices"}, "bench.distributed", None),
     ({"kind"}, "bench.table", None),

@@ -1,12 +1,17 @@
 """What a start costs a flow: the kinetic energy that vortices keep from a lattice, and from relaxed particles."""
 
+from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
+from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+import jax
 import numpy as np
-import pandas as pd
+import typer
 
+from experiments.bench import table
 from jfrnn import sph
 from jfrnn.cases import fluids
 from jfrnn.cases.fluids import FluidScene
@@ -19,19 +24,18 @@ STARTS = ("lattice", "off by 0.2 spacings", "relaxed")
 _REYNOLDS, _END = 100.0, 2.0
 
 
-def run(resolutions: tuple[int, ...], folder: Path) -> str:
-    """Run the vortices from each start, with each scheme, and write table.csv, of which rows that are there stay."""
-    path = folder / "table.csv"
-    rows = pd.read_csv(path).to_dict("records") if path.exists() else []
-    for nx in resolutions:
-        for scheme, physics in SCHEMES.items():
-            for start in STARTS:
-                about = {"nx": nx, "scheme": scheme, "start": start}
-                if any(about.items() <= row.items() for row in rows):
-                    continue
-                rows.append(about | {"kept": kept(begin(nx, physics, start))})
-                pd.DataFrame(rows).to_csv(path, index=False)
-    return pd.DataFrame(rows).to_string(index=False)
+def command(
+    resolutions: Annotated[list[int] | None, typer.Argument(min=8, help="Particles along each axis; 25 and 50 without.")] = None,
+    out: Annotated[Path, typer.Option(help="Folder of the table.")] = Path("out") / "sph-start",
+) -> str:
+    """Run decaying vortices from a lattice, from displaced and from relaxed particles, or go on with it; then print a table."""
+    jax.config.update("jax_enable_x64", True)
+    parts = [(" ".join(map(str, kind)), partial(_rows, *kind)) for kind in product(resolutions or (25, 50), SCHEMES, STARTS)]
+    return table.text(table.measure(out, "table", parts, None, ("nx", "scheme", "start", "kept")))
+
+
+def _rows(nx: int, scheme: str, start: str) -> Iterator[table.Line]:
+    yield {"nx": nx, "scheme": scheme, "start": start, "kept": kept(begin(nx, SCHEMES[scheme], start))}
 
 
 def begin(nx: int, physics: dict[str, Any], start: str) -> FluidScene:

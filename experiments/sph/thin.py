@@ -1,12 +1,16 @@
 """What it costs that water does not feel water through a thin wall: steps per second of two blocks beside a sheet."""
 
+from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
-from time import perf_counter
-from typing import Any
+from typing import Annotated
 
+import jax
 import numpy as np
-import pandas as pd
+import typer
 
+from experiments import _measure
+from experiments.bench import table
 from jfrnn import sph
 from jfrnn.cases import meshes
 from jfrnn.cases.fluids import FluidScene
@@ -14,28 +18,25 @@ from jfrnn.cases.fluids import FluidScene
 STEPS, ROUNDS = 20, 5
 
 
-def run(sizes: tuple[int, ...], folder: Path) -> str:
-    """Time steps with and without lines of sight, in turns, and write table.csv."""
-    import jax
+def command(
+    sizes: Annotated[list[int] | None, typer.Argument(min=4, help="Particles along a block; 16 and 32 without.")] = None,
+    out: Annotated[Path, typer.Option(help="Folder of the table.")] = Path("out") / "sph-thin",
+) -> str:
+    """Time steps beside a thin wall, with lines of sight ("sight") and without ("through"), in turns; then print a table."""
+    parts = [(f"{n}^3", partial(_rows, n)) for n in sizes or (16, 32)]
+    return table.text(table.measure(out, "table", parts, None, ("device", "particles", "parted pairs", "through", "sight")))
 
-    rows: list[dict[str, Any]] = []
-    for n in sizes:
-        ready, times = {}, {}
-        for thin in (False, True):
-            scene = blocks(n, thin)
-            model = sph.make_model(scene, np.float32)
-            ready[thin] = model, jax.jit(sph.begin)(model, sph.make_state(scene, np.float32))
-            jax.block_until_ready(sph.advance(*ready[thin], None, STEPS))
-        for _ in range(ROUNDS):
-            for thin, (model, s) in ready.items():
-                start = perf_counter()
-                jax.block_until_ready(sph.advance(model, s, None, STEPS))
-                times.setdefault(thin, []).append((perf_counter() - start) / STEPS)
-        sight = ready[True][1].solid.sight
-        row = {"device": jax.devices()[0].device_kind, "particles": 2 * n**3, "parted pairs": int(sight.required[2])}
-        rows.append(row | {"through": 1 / np.median(times[False]), "sight": 1 / np.median(times[True])})
-        pd.DataFrame(rows).to_csv(folder / "table.csv", index=False)
-    return pd.DataFrame(rows).to_string(index=False)
+
+def _rows(n: int) -> Iterator[table.Line]:
+    ready = {}
+    for name, thin in (("through", False), ("sight", True)):
+        scene = blocks(n, thin)
+        model = sph.make_model(scene, np.float32)
+        ready[name] = model, jax.jit(sph.begin)(model, sph.make_state(scene, np.float32))
+    calls = {name: lambda both=both: sph.advance(*both, None, STEPS) for name, both in ready.items()}
+    seconds, _ = _measure.time_in_turns(calls, ROUNDS)
+    row = {"particles": 2 * n**3, "parted pairs": int(ready["sight"][1].solid.sight.required[2])}
+    yield row | {name: float(STEPS / np.median(each)) for name, each in seconds.items()}
 
 
 def blocks(n: int, thin: bool) -> FluidScene:

@@ -14,7 +14,6 @@ from experiments import _config
 from experiments._cli import app
 from experiments._errors import UsageError
 from experiments.bench import sums, sums_report, ways
-from experiments.sph import speed
 
 CONFIGS = ROOT / "experiments" / "configs"
 TINY = """
@@ -116,11 +115,6 @@ def test_an_error_is_said_with_its_unit(tmp_path):
     row = replace(ROW, error=0.19)
     assert sums.describe(row).endswith(", error 0.19 eps·√neighbors")
     assert "error [eps·√neighbors]" in sums_report.report([row], tmp_path).splitlines()[0]
-    run = speed.StepRow(
-        **{"key": "a", "kind": "tradeoff", "way": "list", "scene": "taylor-green", "nx": 8, "dtype": "float32", "steps": 10},
-        **{"skin": 0.3, "status": "ok", "seconds": 1.0, "error": {"l2 of velocity": 0.19}},
-    )
-    assert speed.describe(run).endswith("1 s, error of l2 of velocity 19 %")
 
 
 @pytest.mark.parametrize("gradient", [False, True])
