@@ -29,7 +29,7 @@ class Bench(_commands.Commands):
     """Questions of one table each."""
 
     there = {  # noqa: RUF012
-        name.removesuffix("_report"): (f"experiments.bench.{name}", "command", text)
+        name: (f"experiments.bench.{name}", "command", text)
         for name, text in {
             "crystals": "Time batches of crystals in cells of their own.",
             "distributed": "Time lists, sums and fluids on 1 to k devices.",
@@ -42,7 +42,7 @@ class Bench(_commands.Commands):
             "start": "Time a fresh process up to its first result.",
             "guides": "Time the code of each guide, and count what it compiles.",
             "structures": "Time structures of atoms, one after another.",
-            "sums_report": "Measure one sum over neighbors in many ways.",
+            "sums": "Measure one sum over neighbors in many ways.",
             "ties": "Time lattices full of exact ties.",
             "triangles": "Time the triangles that are near particles.",
         }.items()
@@ -122,9 +122,9 @@ def _read_shard(text: str) -> tuple[int, int]:
 def report(folder: Annotated[Path, typer.Argument(help="Folder with rows.jsonl.")]) -> None:
     """Print the table of what was measured, and write it and pictures beside the rows: of a sweep, beside the thesis's figures."""
     with usage_errors():
-        from experiments import _reports
+        from experiments import _report
 
-        _reports.report(folder)
+        _report.report(folder)
 
 
 @app.command(short_help="Make the tables of README.md and docs/ anew.")

@@ -40,7 +40,7 @@ def _answer(task: dict[str, Any]) -> dict[str, Any]:
     if task["do"] == "sum":
         from experiments.bench import ways
 
-        return ways.measure(ways.Spec(**task["spec"]))
+        return ways.measure(task["spec"])
     spec, folder = Spec(**task["spec"]), Path(task["oracle"])
     return prepare_oracle(spec, folder) if task["do"] == "oracle" else measure(spec, folder)
 
