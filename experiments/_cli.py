@@ -22,47 +22,8 @@ from experiments._commands import (
 )
 from experiments._errors import UsageError
 
-app = typer.Typer(cls=_commands.Commands, no_args_is_help=True, add_completion=False, rich_markup_mode=None)
-
-
-class Bench(_commands.Commands):
-    """Questions of one table each."""
-
-    there = {  # noqa: RUF012
-        name: (f"experiments.bench.{name}", "command", text)
-        for name, text in {
-            "crystals": "Time batches of crystals in cells of their own.",
-            "distributed": "Time lists, sums and fluids on 1 to k devices.",
-            "arrays": "Time the array engine beside jax-md.",
-            "latency": "Time calls for few particles.",
-            "lj": "Time a Lennard-Jones liquid, beside jax-md, OpenMM and LAMMPS.",
-            "options": "Time each option of a search.",
-            "peers": "Ask other libraries for the hard cases.",
-            "skin": "Time a list that is kept while particles move.",
-            "start": "Time a fresh process up to its first result.",
-            "guides": "Time the code of each guide, and count what it compiles.",
-            "structures": "Time structures of atoms, one after another.",
-            "sums": "Measure one sum over neighbors in many ways.",
-            "ties": "Time lattices full of exact ties.",
-            "triangles": "Time the triangles that are near particles.",
-        }.items()
-    }
-
-
-class Sph(_commands.Commands):
-    """What measures and validates the fluid solver; `python -m jfrnn.sph` runs it."""
-
-    there = {  # noqa: RUF012
-        name: (f"experiments.sph.{'commands' if name == 'peers' else name}", "peers" if name == "peers" else "command", text)
-        for name, text in {
-            "validate": "Run fluid scenes with known answers.",
-            "speed": "Time steps of a fluid scene.",
-            "gradients": "Solve inverse problems by gradients.",
-            "peers": "Time steps of solvers that others released.",
-            "thin": "Time steps beside a thin wall.",
-            "start": "Run vortices from a lattice and from relaxed particles.",
-        }.items()
-    }
+_GPU = {"gpu": ("experiments.bench.gpu", "Decide the hard cases on a GPU, take timings.")}
+app = typer.Typer(cls=_commands.those_of(_GPU), no_args_is_help=True, add_completion=False, rich_markup_mode=None)
 
 
 @app.command(short_help="Run a sweep, or go on with it.")
@@ -196,26 +157,39 @@ def export(
         typer.echo(_export.write(scene, take_file(out), counts))
 
 
-_BENCH = typer.Typer(cls=Bench, no_args_is_help=True, rich_markup_mode=None)
-app.add_typer(_BENCH, name="bench", short_help="Answer a question with a table: bench NAME.")
+def _add_group(name: str, text: str, module: str, there: dict[str, str]) -> None:
+    """Add a group of commands, each the function `command` of the module of its name."""
+    kind = _commands.those_of({each: (f"{module}.{each}", short) for each, short in there.items()})
+    app.add_typer(typer.Typer(cls=kind, no_args_is_help=True, rich_markup_mode=None), name=name, short_help=text)
 
 
-@app.command(short_help="Decide the hard cases on a GPU, take timings.")
-def gpu(
-    config: Annotated[Path, typer.Argument(help="GPU config, TOML.")],
-    out: Annotated[Path, typer.Option(help="Folder of the rows.")],
-) -> None:
-    """Decide every hard case on the GPU, then take all timings; rows are added to OUT/rows.jsonl one by one."""
-    with usage_errors():
-        from experiments import _config
-        from experiments.gpu import run
-        from experiments.gpu.config import Config
-
-        wrong = run.run(_config.load(config, Config), take_folder(out))
-        typer.echo(f"{wrong} wrong; rows in {out / 'rows.jsonl'}; python -m experiments report {out} makes a table of them")
-        if wrong:
-            raise typer.Exit(1)
-
-
-_SPH = typer.Typer(cls=Sph, no_args_is_help=True, rich_markup_mode=None)
-app.add_typer(_SPH, name="sph", short_help="Validate, time and differentiate the fluid solver.")
+_add_group(
+    *("bench", "Answer a question with a table: bench NAME.", "experiments.bench"),
+    {
+        "crystals": "Time batches of crystals in cells of their own.",
+        "distributed": "Time lists, sums and fluids on 1 to k devices.",
+        "arrays": "Time the array engine beside jax-md.",
+        "latency": "Time calls for few particles.",
+        "lj": "Time a Lennard-Jones liquid, beside jax-md, OpenMM and LAMMPS.",
+        "options": "Time each option of a search.",
+        "peers": "Ask other libraries for the hard cases.",
+        "skin": "Time a list that is kept while particles move.",
+        "start": "Time a fresh process up to its first result.",
+        "guides": "Time the code of each guide, and count what it compiles.",
+        "structures": "Time structures of atoms, one after another.",
+        "sums": "Measure one sum over neighbors in many ways.",
+        "ties": "Time lattices full of exact ties.",
+        "triangles": "Time the triangles that are near particles.",
+    },
+)
+_add_group(
+    *("sph", "Validate, time and differentiate the fluid solver.", "experiments.sph"),
+    {
+        "validate": "Run fluid scenes with known answers.",
+        "speed": "Time steps of a fluid scene.",
+        "gradients": "Solve inverse problems by gradients.",
+        "peers": "Time steps of solvers that others released.",
+        "thin": "Time steps beside a thin wall.",
+        "start": "Run vortices from a lattice and from relaxed particles.",
+    },
+)

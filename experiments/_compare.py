@@ -74,17 +74,6 @@ def is_exact(oracle: Any, idx: Any, count: Any, fill: int, expected: Any) -> boo
     return not any(oracle.compare(found, expected))
 
 
-def different_rows(one: Any, other: Any) -> int:  # noqa: ANN401
-    """Count the rows of two padded lists that differ as sets."""
-    import jax.numpy as jnp
-
-    different = 0
-    for start in range(0, len(one), 1 << 17):
-        part = slice(start, start + (1 << 17))
-        different += int((jnp.sort(one[part], axis=1) != jnp.sort(other[part], axis=1)).any(axis=1).sum())
-    return different
-
-
 def _keys(i: np.ndarray, j: np.ndarray, size: int) -> np.ndarray:
     """Return the sorted keys min(i, j)·n + max(i, j)."""
     return np.sort(np.minimum(i, j).astype(np.int64) * size + np.maximum(i, j))

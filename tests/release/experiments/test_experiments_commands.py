@@ -12,17 +12,17 @@ from typer.testing import CliRunner
 from experiments import _commands, _config
 from experiments._cli import app
 from experiments._errors import UsageError
-from experiments.gpu.config import Config
+from experiments.bench.gpu import Config
 
 ROOT = Path(_commands.__file__).resolve().parent.parent
 CONFIGS = ROOT / "experiments" / "configs"
-TOP = ("run", "init", "report", "tables", "merge", "list", "show", "export", "gpu", "bench", "sph")
+TOP = ("run", "init", "report", "tables", "merge", "list", "show", "export", "bench", "sph", "gpu")
 BENCH = (
     *("crystals", "distributed", "arrays", "latency", "lj", "options", "peers", "skin", "start", "guides"),
     *("structures", "sums", "ties", "triangles"),
 )
 SPH = ("validate", "speed", "gradients", "peers", "thin", "start")
-COMMANDS = (*TOP[:9], *(f"bench {name}" for name in BENCH), *(f"sph {name}" for name in SPH))
+COMMANDS = (*TOP[:8], "gpu", *(f"bench {name}" for name in BENCH), *(f"sph {name}" for name in SPH))
 
 
 def refused(*arguments):
@@ -136,15 +136,13 @@ def test_configs_that_are_none(tmp_path, command):
 
 def test_a_key_in_a_table_of_a_config_is_told_what_its_table_allows(tmp_path):
     path = tmp_path / "gpu.toml"
-    path.write_text(
-        (CONFIGS / "h200.toml").read_text()
-        + "\n[[triangles]]\npoints = [1]\nfaces = 500\ncutoffs = [nan]\ndtypes = []\nspeed = 1\n"
-    )
+    path.write_text('[[exactness]]\nbackend = "warp"\ndtypes = ["float16"]\ndims = []\ncapacity = 0\nspeed = 1\n')
     with pytest.raises(UsageError) as caught:
         _config.load(path, Config)
     lines = str(caught.value).splitlines()
-    assert f"{path}: triangles[0].speed: unknown key (value 1); allowed: points, faces, cutoffs, dtypes" in lines
-    assert f"{path}: triangles[0].cutoffs[0]: got nan; input should be a finite number" in lines
+    allowed = "backend, dtypes, dims, capacity, cases, least_rows"
+    assert f"{path}: exactness[0].speed: unknown key (value 1); allowed: {allowed}" in lines
+    assert f"{path}: exactness[0].dtypes[0]: got 'float16'; input should be 'float32' or 'float64'" in lines
 
 
 @pytest.mark.parametrize(
