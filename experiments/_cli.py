@@ -22,7 +22,7 @@ from experiments._commands import (
 )
 from experiments._errors import UsageError
 
-_GPU = {"gpu": ("experiments.bench.gpu", "Decide the hard cases on a GPU, take timings.")}
+_GPU = {"gpu": ("experiments.bench.gpu", "Decide the hard cases on this device, take timings.")}
 app = typer.Typer(cls=_commands.those_of(_GPU), no_args_is_help=True, add_completion=False, rich_markup_mode=None)
 
 
@@ -133,7 +133,7 @@ def show(
 
         scene = _layouts.make(layout, spacing=spacing, dim=dim, seed=seed, fill=fill)
         path = out or Path("out") / f"{layout}.png"
-        _show.check(path)
+        _commands.check_ending(path, _show.endings())
         typer.echo(_show.draw(scene, take_file(path)))
 
 
@@ -152,7 +152,7 @@ def export(
     with usage_errors():
         from experiments import _export, _layouts
 
-        _export.check(out)
+        _commands.check_ending(out, _export.ENDINGS)
         scene = _layouts.make(layout, spacing=spacing, dim=dim, seed=seed, fill=fill, dtype=dtype)
         typer.echo(_export.write(scene, take_file(out), counts))
 
@@ -173,7 +173,6 @@ _add_group(
         "lj": "Time a Lennard-Jones liquid, beside jax-md, OpenMM and LAMMPS.",
         "options": "Time each option of a search.",
         "peers": "Ask other libraries for the hard cases.",
-        "skin": "Time a list that is kept while particles move.",
         "start": "Time a fresh process up to its first result.",
         "guides": "Time the code of each guide, and count what it compiles.",
         "structures": "Time structures of atoms, one after another.",
@@ -189,7 +188,5 @@ _add_group(
         "speed": "Time steps of a fluid scene.",
         "gradients": "Solve inverse problems by gradients.",
         "peers": "Time steps of solvers that others released.",
-        "thin": "Time steps beside a thin wall.",
-        "start": "Run vortices from a lattice and from relaxed particles.",
     },
 )

@@ -153,6 +153,12 @@ def check_names(kind: str, names: Sequence[str] | None, allowed: Iterable[str]) 
         raise UsageError(f"no {kind} {unknown[0]!r}; allowed: {', '.join(allowed)}")
 
 
+def check_ending(path: Path, allowed: Sequence[str]) -> None:
+    """Refuse a file whose ending names no format; see `check_choice`."""
+    if path.suffix not in allowed:
+        raise UsageError(f"--out {path}: unknown ending {path.suffix!r}; allowed: {', '.join(allowed)}")
+
+
 def take_folder(folder: Path, option: str = "--out") -> Path:
     """Make the folder that takes what a command writes, and return it.
 

@@ -5,24 +5,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from experiments._errors import UsageError
-
 if TYPE_CHECKING:
     from cases import Scene
 
 ENDINGS = (".csv", ".vtp", ".vtk")
 NEIGHBORS = "neighbors"
 DIGITS = {np.dtype(np.float32): 9, np.dtype(np.float64): 17}  # enough to read the same float back
-
-
-def check(path: Path) -> None:
-    """Refuse a file whose ending names no format.
-
-    Raises:
-        UsageError: It is none of `ENDINGS`.
-    """
-    if path.suffix not in ENDINGS:
-        raise UsageError(f"--out {path}: unknown ending {path.suffix!r}; allowed: {', '.join(ENDINGS)}")
 
 
 def write(scene: "Scene", path: Path, counts: bool = False) -> Path:
@@ -39,16 +27,13 @@ def write(scene: "Scene", path: Path, counts: bool = False) -> Path:
     Returns:
         The path.
     """
-    neighbors = _count(scene) if counts else None
-    path.parent.mkdir(parents=True, exist_ok=True)
+    neighbors = None
+    if counts:
+        from experiments import _oracle
+
+        neighbors = _oracle.count_neighbors(_oracle.find_pairs(scene.positions, scene.cutoff), scene.n)
     (_write_csv if path.suffix == ".csv" else _write_vtk)(scene, path, neighbors)
     return path
-
-
-def _count(scene: "Scene") -> np.ndarray:
-    from experiments import _oracle
-
-    return _oracle.count_neighbors(_oracle.find_pairs(scene.positions, scene.cutoff), scene.n)
 
 
 def _write_csv(scene: "Scene", path: Path, neighbors: np.ndarray | None) -> None:

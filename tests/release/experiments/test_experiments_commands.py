@@ -18,10 +18,10 @@ ROOT = Path(_commands.__file__).resolve().parent.parent
 CONFIGS = ROOT / "experiments" / "configs"
 TOP = ("run", "init", "report", "tables", "merge", "list", "show", "export", "bench", "sph", "gpu")
 BENCH = (
-    *("crystals", "distributed", "arrays", "latency", "lj", "options", "peers", "skin", "start", "guides"),
+    *("crystals", "distributed", "arrays", "latency", "lj", "options", "peers", "start", "guides"),
     *("structures", "sums", "ties", "triangles"),
 )
-SPH = ("validate", "speed", "gradients", "peers", "thin", "start")
+SPH = ("validate", "speed", "gradients", "peers")
 COMMANDS = (*TOP[:8], "gpu", *(f"bench {name}" for name in BENCH), *(f"sph {name}" for name in SPH))
 
 
@@ -57,7 +57,7 @@ def test_the_list_of_commands_fits_a_screen(group, names):
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_help_keeps_what_stands_in_brackets(command):
-    units = {"show": ["[m]"], "export": ["[m]"], "run": ["[s]"], "bench skin": ["[m]"]}
+    units = {"show": ["[m]"], "export": ["[m]"], "run": ["[s]"]}
     units |= {"bench triangles": ["[modules]"], "bench peers": ["[s]", "--group peers"]}
     units |= {"bench latency": ["[µs]"], "bench start": ["[s]"], "bench structures": ["angstrom"]}
     text = told(*command.split(), "--help")
@@ -77,10 +77,10 @@ def test_list_says_what_there_is():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("bench", "skin", "--steps", "0"), "--steps 0: "),
-        (("bench", "skin", "--repeats=1"), "--repeats 1: "),
-        (("bench", "skin", "--spacing", "nan"), "--spacing nan: "),
-        (("bench", "skin", "--spacing", "-1"), "--spacing -1: "),
+        (("bench", "lj", "--steps", "0"), "--steps 0: "),
+        (("bench", "arrays", "--repeats=1"), "--repeats 1: "),
+        (("show", "corners", "--spacing", "nan"), "--spacing nan: "),
+        (("show", "corners", "--spacing", "-1"), "--spacing -1: "),
         (("bench", "triangles", "--points", "10000000000"), "--points 10000000000: "),
         (("bench", "triangles", "--points", "abc"), "--points abc: "),
         (("bench", "triangles", "--rounds", "1"), "--rounds 1: "),
@@ -178,9 +178,7 @@ def test_steps_are_timed_of_scenes_that_have_an_nx(tmp_path):
         ("sph", "validate", "one"),
         ("sph", "gradients", "memory"),
         ("sph", "peers"),
-        ("sph", "start"),
-        ("sph", "thin"),
-        *(("bench", name) for name in ("options", "ties", "triangles", "skin", "latency", "start")),
+        *(("bench", name) for name in ("options", "ties", "triangles", "latency", "start")),
         ("bench", "peers", "scipy"),
     ],
     ids=lambda arguments: " ".join(map(str, arguments[:2])),
