@@ -6,20 +6,7 @@ from typing import Annotated
 import typer
 
 from experiments import _commands
-from experiments._commands import (
-    Dim,
-    Fill,
-    Layout,
-    RetryFailed,
-    RowsFolder,
-    Seed,
-    Spacing,
-    positive,
-    stoppable,
-    take_file,
-    take_folder,
-    usage_errors,
-)
+from experiments._commands import take_file, take_folder, usage_errors
 from experiments._errors import UsageError
 
 _GPU = {"gpu": ("experiments.bench.gpu", "Decide the hard cases on this device, take timings.")}
@@ -29,11 +16,11 @@ app = typer.Typer(cls=_commands.those_of(_GPU), no_args_is_help=True, add_comple
 @app.command(short_help="Run a sweep, or go on with it.")
 def run(
     config: Annotated[Path, typer.Argument(help="Sweep config, TOML.")],
-    out: RowsFolder = None,
-    retry_failed: RetryFailed = False,
+    out: _commands.RowsFolder = None,
+    retry_failed: _commands.RetryFailed = False,
     processes: Annotated[int | None, typer.Option(min=1, max=10_000, help="Of each row, instead of the config's.")] = None,
     most_seconds: Annotated[
-        float | None, typer.Option(callback=positive, help="That repeats of a row may take [s], instead of the config's.")
+        float | None, typer.Option(callback=_commands.positive, help="That repeats of a row may take [s], instead of the config's.")
     ] = None,
     method_names: Annotated[str | None, typer.Option("--methods", help="A,B,C: instead of the config's.")] = None,
     layouts: Annotated[str | None, typer.Option(help="A,B,C: instead of the config's, with its fills.")] = None,
@@ -49,7 +36,7 @@ def run(
         given = _config.narrow(_config.load(config), **asked, processes=processes, most_seconds=most_seconds)
         folder = out or Path("out") / config.stem
         folder = take_folder(folder if parts == 1 else folder / f"shard-{part}-of-{parts}")
-        with stoppable():
+        with _commands.stoppable():
             rows = _sweep.run(given, config.stem, folder, retry_failed, (part, parts))
         typer.echo(f"{_sweep.count_results(rows)}; rows in {folder / 'rows.jsonl'}")
 
@@ -63,11 +50,11 @@ def _split(text: str | None) -> list[str] | None:
 def init(path: Annotated[Path, typer.Argument(help="TOML file.")] = Path("sweep.toml")) -> None:
     """Write a config of a small sweep, with every key, its default and what it means."""
     with usage_errors():
-        from experiments import _keys
+        from experiments.pages import configs
 
         if path.exists():
             raise UsageError(f"{path}: there is such a file already; name another")
-        take_file(path, "PATH").write_text(_keys.example(), encoding="utf-8")
+        take_file(path, "PATH").write_text(configs.example(), encoding="utf-8")
         typer.echo(f"{path}; run it: python -m experiments run {path}")
 
 
@@ -113,18 +100,28 @@ def merge(
 @app.command(name="list", short_help="Say what layouts, methods and configs there are.")
 def list_names() -> None:
     """Print the names of layouts, methods and configs; `python -m jfrnn.sph list` prints those of fluid scenes."""
-    from experiments import _list
+    import textwrap
 
-    typer.echo(_list.names())
+    from experiments import _layouts, methods
+
+    absent = [name for name in methods.names() if methods.lacks(name)]
+    parts = {
+        "Layouts (show, export, configs; N is any number of tiles)": _layouts.names(),
+        "Methods (configs of run)": [name for name in methods.names() if name not in absent],
+        "Methods that are not installed": absent,
+        "Configs (experiments/configs)": sorted(path.stem for path in (Path(__file__).parent / "configs").glob("*.toml")),
+    }
+    wrap = textwrap.TextWrapper(80, initial_indent="  ", subsequent_indent="  ", break_on_hyphens=False)
+    typer.echo("\n\n".join(f"{title}:\n{wrap.fill(', '.join(known))}" for title, known in parts.items() if known))
 
 
 @app.command(short_help="Draw a layout.")
 def show(
-    layout: Layout,
-    fill: Fill = None,
-    spacing: Spacing = 1e-4,
-    dim: Dim = 3,
-    seed: Seed = 0,
+    layout: _commands.Layout,
+    fill: _commands.Fill = None,
+    spacing: _commands.Spacing = 1e-4,
+    dim: _commands.Dim = 3,
+    seed: _commands.Seed = 0,
     out: Annotated[Path | None, typer.Option(help="Picture; out/LAYOUT.png without it.")] = None,
 ) -> None:
     """Draw a layout."""
@@ -139,12 +136,12 @@ def show(
 
 @app.command(short_help="Write the points of a layout to a file.")
 def export(
-    layout: Layout,
+    layout: _commands.Layout,
     out: Annotated[Path, typer.Option(help="File: .csv, .vtp or .vtk.")],
-    fill: Fill = None,
-    spacing: Spacing = 1e-4,
-    dim: Dim = 3,
-    seed: Seed = 0,
+    fill: _commands.Fill = None,
+    spacing: _commands.Spacing = 1e-4,
+    dim: _commands.Dim = 3,
+    seed: _commands.Seed = 0,
     dtype: Annotated[str, typer.Option(help="float32 or float64.")] = "float32",
     counts: Annotated[bool, typer.Option("--counts", help="Store the number of neighbors of each point too.")] = False,
 ) -> None:

@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+import pandas as pd
 
 if TYPE_CHECKING:
     from cases import Scene
@@ -37,11 +38,9 @@ def write(scene: "Scene", path: Path, counts: bool = False) -> Path:
 
 
 def _write_csv(scene: "Scene", path: Path, neighbors: np.ndarray | None) -> None:
-    columns, formats = [scene.positions], [f"%.{DIGITS[scene.positions.dtype]}g"] * scene.dim
-    names = list("xyz"[: scene.dim])
-    if neighbors is not None:
-        columns, formats, names = [*columns, neighbors[:, None]], [*formats, "%d"], [*names, NEIGHBORS]
-    np.savetxt(path, np.hstack(columns), fmt=formats, delimiter=",", header=",".join(names), comments="")
+    frame = pd.DataFrame(scene.positions, columns=list("xyz"[: scene.dim]))
+    frame = frame if neighbors is None else frame.assign(**{NEIGHBORS: neighbors})
+    frame.to_csv(path, index=False, float_format=f"%.{DIGITS[scene.positions.dtype]}g")
 
 
 def _write_vtk(scene: "Scene", path: Path, neighbors: np.ndarray | None) -> None:

@@ -59,13 +59,6 @@ def forget_freed_memory() -> None:
         mallopt(trim_threshold, 0)
 
 
-def device_bytes(what: str) -> int | None:
-    """Return what JAX's allocator says of its first device, such as "bytes_in_use"; None where it says nothing."""
-    import jax
-
-    return (jax.devices()[0].memory_stats() or {}).get(what)
-
-
 class DeviceMemory:
     """Peak memory of the accelerator since the moment of creation, of what JAX and Warp take; not their programs."""
 

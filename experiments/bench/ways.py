@@ -40,11 +40,16 @@ class Way(NamedTuple):
     sums: bool = True  # else it only searches
 
 
+def poly6_scale(cutoff: float) -> float:
+    """Return what makes that kernel's integral 1."""
+    return 315 / (64 * math.pi * cutoff**3)
+
+
 def poly6(cutoff: float) -> Callable[[Any, Any, Any], Any]:
     """Return a density's kernel (Müller et al. 2003, doi:10.2312/SCA03/154-159) for `jfrnn.pair_sum`."""
     import jax.numpy as jnp
 
-    scale = 315 / (64 * math.pi * cutoff**3)
+    scale = poly6_scale(cutoff)
 
     def kernel(r: Any, i: Any, j: Any) -> Any:  # noqa: ANN401
         return j * scale * jnp.maximum(1 - r @ r / cutoff**2, 0.0) ** 3
@@ -75,7 +80,7 @@ def reference(given: Given, rows: np.ndarray, gradient: bool) -> tuple[np.ndarra
     place, j = np.repeat(np.arange(len(rows)), [len(row) for row in found]), np.concatenate([*found]).astype(np.int64)
     place, j = place[j != rows[place]], j[j != rows[place]]
     r = x[j] - x[rows[place]]
-    inside, scale = np.maximum(1 - (r**2).sum(axis=1) / h**2, 0), 315 / (64 * math.pi * h**3)
+    inside, scale = np.maximum(1 - (r**2).sum(axis=1) / h**2, 0), poly6_scale(h)
     terms = (m[j] * scale * inside**3)[:, None]
     if gradient:
         terms = np.hstack([terms, ((m[j] + m[rows[place]]) * scale * 6 / h**2 * inside**2)[:, None] * r])
@@ -130,7 +135,7 @@ def _measure_way(way: Way, spec: dict[str, Any], positions: np.ndarray, cutoff: 
     jax.config.update("jax_enable_x64", spec["dtype"] == "float64")
     masses = np.random.default_rng(spec["seed"]).uniform(0.5, 1.5, len(positions)).astype(positions.dtype)
     given = Given(jax.numpy.asarray(positions), jax.numpy.asarray(masses), cutoff)
-    used_before = _measure.device_bytes("bytes_in_use")
+    device = _measure.DeviceMemory()
     steps, building = way.prepare(given, spec["gradient"], spec["compensated"]), []
 
     def once() -> Any:  # noqa: ANN401
@@ -159,8 +164,8 @@ def _measure_way(way: Way, spec: dict[str, Any], positions: np.ndarray, cutoff: 
     memory = _measure.PeakMemory()
     once()
     row |= {"peak_bytes": memory.peak() - memory.start, "memory_source": memory.source}
-    if (peak := _measure.device_bytes("peak_bytes_in_use")) is not None:  # which is never forgotten; compiling does not raise it
-        row |= {"peak_bytes": peak - (used_before or 0), "memory_source": "memory_stats"}
+    if (peak := device.peak()) is not None:  # compiling does not raise it
+        row |= {"peak_bytes": peak, "memory_source": "device"}
 
 
 # --- the ways ---------------------------------------------------------------------------------------------------------

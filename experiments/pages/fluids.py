@@ -1,19 +1,13 @@
 """Tables of the fluid solver."""
 
+from functools import partial
+
 from experiments.pages.rows import RESULTS, markdown, number, one, read, whole
 
 
-def validation() -> str:
-    """Return what was measured of fluids with known answers."""
-    return _beside_answers([row for row in read("sph/table.csv") if row["case"] != "sedov"])
-
-
-def blast() -> str:
-    """Return what was measured of a blast in a gas."""
-    return _beside_answers([row for row in read("sph/table.csv") if row["case"] == "sedov"])
-
-
-def _beside_answers(rows: list[dict[str, str]]) -> str:
+def validation(blast: bool) -> str:
+    """Return what was measured of a blast in a gas, or of the fluids with known answers."""
+    rows = [row for row in read("sph/table.csv") if (row["case"] == "sedov") == blast]
     heads = ("case", "what is measured", ">measured", "target", "met", ">particles", ">steps", ">seconds", "on")
     names = ("case", "quantity", "measured", "target", "met", "particles", "steps", "seconds", "device")
     return markdown(heads, ([row[name] for name in names] for row in rows))
@@ -107,8 +101,8 @@ def kept() -> str:
 
 
 TABLES = {
-    "sph-validation": validation,
-    "sph-blast": blast,
+    "sph-validation": partial(validation, blast=False),
+    "sph-blast": partial(validation, blast=True),
     "sph-inverse": inverse,
     "sph-memory": reverse_memory,
     "sph-ways": ways,
