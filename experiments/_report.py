@@ -1,6 +1,5 @@
 """The report of a folder of rows, by what the first of them says; of a sweep a short table, table.csv and pictures."""
 
-import csv
 import json
 import math
 from collections.abc import Iterable
@@ -8,6 +7,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
 from rich import box
 from rich.console import Console
 from rich.table import Table
@@ -58,10 +58,7 @@ def report_sweep(folder: Path) -> None:
 
     lines = _table.lines(rows)
     pictures = _plots.draw_all(_statistics.summarize(rows), folder, describe_origin(rows))
-    with (folder / "table.csv").open("w", encoding="utf-8", newline="") as stream:
-        writer = csv.DictWriter(stream, _table.COLUMNS)
-        writer.writeheader()
-        writer.writerows(lines)
+    pd.DataFrame(lines, columns=[*_table.COLUMNS], dtype=object).to_csv(folder / "table.csv", index=False, lineterminator="\r\n")
     console = Console(highlight=False, markup=False)
     if not console.is_terminal:
         console.width = 80
