@@ -10,10 +10,13 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import pandas as pd
+import typer
+
+from experiments._commands import take_folder
 
 WATER = 30_752  # particles of the column `dam-break-3d` at nx = 31
 STEPS = 20
@@ -31,6 +34,11 @@ CONTENT = {
     "bounce off, kick and drift; its smoothing length made 2 spacings, its mass that of its density at rest; float32",
 }
 Row = dict[str, Any]
+
+
+def command(out: Annotated[Path, typer.Option(help="Folder of the table.")] = Path("out") / "sph-peers") -> str:
+    """Time steps of solvers that others released and that are installed here, or go on with it; then print a table."""
+    return run(take_folder(out))
 
 
 def run(folder: Path) -> str:
