@@ -6,73 +6,21 @@ from typing import Annotated
 import typer
 
 from experiments import _commands
-from experiments._commands import (
-    Dim,
-    Fill,
-    Layout,
-    RetryFailed,
-    RowsFolder,
-    Seed,
-    Spacing,
-    positive,
-    stoppable,
-    take_file,
-    take_folder,
-    usage_errors,
-)
+from experiments._commands import take_file, take_folder, usage_errors
 from experiments._errors import UsageError
 
-app = typer.Typer(cls=_commands.Commands, no_args_is_help=True, add_completion=False, rich_markup_mode=None)
-
-
-class Bench(_commands.Commands):
-    """Questions of one table each."""
-
-    there = {  # noqa: RUF012
-        name.removesuffix("_report"): (f"experiments.bench.{name}", "command", text)
-        for name, text in {
-            "crystals": "Time batches of crystals in cells of their own.",
-            "distributed": "Time lists, sums and fluids on 1 to k devices.",
-            "arrays": "Time the array engine beside jax-md.",
-            "latency": "Time calls for few particles.",
-            "lj": "Time a Lennard-Jones liquid, beside jax-md, OpenMM and LAMMPS.",
-            "options": "Time each option of a search.",
-            "peers": "Ask other libraries for the hard cases.",
-            "skin": "Time a list that is kept while particles move.",
-            "start": "Time a fresh process up to its first result.",
-            "guides": "Time the code of each guide, and count what it compiles.",
-            "structures": "Time structures of atoms, one after another.",
-            "sums_report": "Measure one sum over neighbors in many ways.",
-            "ties": "Time lattices full of exact ties.",
-            "triangles": "Time the triangles that are near particles.",
-        }.items()
-    }
-
-
-class Sph(_commands.Commands):
-    """What measures and validates the fluid solver; `python -m jfrnn.sph` runs it."""
-
-    there = {  # noqa: RUF012
-        name: ("experiments.sph.commands", name, text)
-        for name, text in {
-            "validate": "Run fluid scenes with known answers.",
-            "speed": "Time steps of a fluid scene.",
-            "gradients": "Solve inverse problems by gradients.",
-            "peers": "Time steps of solvers that others released.",
-            "thin": "Time steps beside a thin wall.",
-            "start": "Run vortices from a lattice and from relaxed particles.",
-        }.items()
-    }
+_GPU = {"gpu": ("experiments.bench.gpu", "Decide the hard cases on this device, take timings.")}
+app = typer.Typer(cls=_commands.those_of(_GPU), no_args_is_help=True, add_completion=False, rich_markup_mode=None)
 
 
 @app.command(short_help="Run a sweep, or go on with it.")
 def run(
     config: Annotated[Path, typer.Argument(help="Sweep config, TOML.")],
-    out: RowsFolder = None,
-    retry_failed: RetryFailed = False,
+    out: _commands.RowsFolder = None,
+    retry_failed: _commands.RetryFailed = False,
     processes: Annotated[int | None, typer.Option(min=1, max=10_000, help="Of each row, instead of the config's.")] = None,
     most_seconds: Annotated[
-        float | None, typer.Option(callback=positive, help="That repeats of a row may take [s], instead of the config's.")
+        float | None, typer.Option(callback=_commands.positive, help="That repeats of a row may take [s], instead of the config's.")
     ] = None,
     method_names: Annotated[str | None, typer.Option("--methods", help="A,B,C: instead of the config's.")] = None,
     layouts: Annotated[str | None, typer.Option(help="A,B,C: instead of the config's, with its fills.")] = None,
@@ -88,7 +36,7 @@ def run(
         given = _config.narrow(_config.load(config), **asked, processes=processes, most_seconds=most_seconds)
         folder = out or Path("out") / config.stem
         folder = take_folder(folder if parts == 1 else folder / f"shard-{part}-of-{parts}")
-        with stoppable():
+        with _commands.stoppable():
             rows = _sweep.run(given, config.stem, folder, retry_failed, (part, parts))
         typer.echo(f"{_sweep.count_results(rows)}; rows in {folder / 'rows.jsonl'}")
 
@@ -102,11 +50,11 @@ def _split(text: str | None) -> list[str] | None:
 def init(path: Annotated[Path, typer.Argument(help="TOML file.")] = Path("sweep.toml")) -> None:
     """Write a config of a small sweep, with every key, its default and what it means."""
     with usage_errors():
-        from experiments import _keys
+        from experiments.pages import configs
 
         if path.exists():
             raise UsageError(f"{path}: there is such a file already; name another")
-        take_file(path, "PATH").write_text(_keys.example(), encoding="utf-8")
+        take_file(path, "PATH").write_text(configs.example(), encoding="utf-8")
         typer.echo(f"{path}; run it: python -m experiments run {path}")
 
 
@@ -122,9 +70,9 @@ def _read_shard(text: str) -> tuple[int, int]:
 def report(folder: Annotated[Path, typer.Argument(help="Folder with rows.jsonl.")]) -> None:
     """Print the table of what was measured, and write it and pictures beside the rows: of a sweep, beside the thesis's figures."""
     with usage_errors():
-        from experiments import _reports
+        from experiments import _report
 
-        _reports.report(folder)
+        _report.report(folder)
 
 
 @app.command(short_help="Make the tables of README.md and docs/ anew.")
@@ -152,18 +100,28 @@ def merge(
 @app.command(name="list", short_help="Say what layouts, methods and configs there are.")
 def list_names() -> None:
     """Print the names of layouts, methods and configs; `python -m jfrnn.sph list` prints those of fluid scenes."""
-    from experiments import _list
+    import textwrap
 
-    typer.echo(_list.names())
+    from experiments import _layouts, methods
+
+    absent = [name for name in methods.names() if methods.lacks(name)]
+    parts = {
+        "Layouts (show, export, configs; N is any number of tiles)": _layouts.names(),
+        "Methods (configs of run)": [name for name in methods.names() if name not in absent],
+        "Methods that are not installed": absent,
+        "Configs (experiments/configs)": sorted(path.stem for path in (Path(__file__).parent / "configs").glob("*.toml")),
+    }
+    wrap = textwrap.TextWrapper(80, initial_indent="  ", subsequent_indent="  ", break_on_hyphens=False)
+    typer.echo("\n\n".join(f"{title}:\n{wrap.fill(', '.join(known))}" for title, known in parts.items() if known))
 
 
 @app.command(short_help="Draw a layout.")
 def show(
-    layout: Layout,
-    fill: Fill = None,
-    spacing: Spacing = 1e-4,
-    dim: Dim = 3,
-    seed: Seed = 0,
+    layout: _commands.Layout,
+    fill: _commands.Fill = None,
+    spacing: _commands.Spacing = 1e-4,
+    dim: _commands.Dim = 3,
+    seed: _commands.Seed = 0,
     out: Annotated[Path | None, typer.Option(help="Picture; out/LAYOUT.png without it.")] = None,
 ) -> None:
     """Draw a layout."""
@@ -172,18 +130,18 @@ def show(
 
         scene = _layouts.make(layout, spacing=spacing, dim=dim, seed=seed, fill=fill)
         path = out or Path("out") / f"{layout}.png"
-        _show.check(path)
+        _commands.check_ending(path, _show.endings())
         typer.echo(_show.draw(scene, take_file(path)))
 
 
 @app.command(short_help="Write the points of a layout to a file.")
 def export(
-    layout: Layout,
+    layout: _commands.Layout,
     out: Annotated[Path, typer.Option(help="File: .csv, .vtp or .vtk.")],
-    fill: Fill = None,
-    spacing: Spacing = 1e-4,
-    dim: Dim = 3,
-    seed: Seed = 0,
+    fill: _commands.Fill = None,
+    spacing: _commands.Spacing = 1e-4,
+    dim: _commands.Dim = 3,
+    seed: _commands.Seed = 0,
     dtype: Annotated[str, typer.Option(help="float32 or float64.")] = "float32",
     counts: Annotated[bool, typer.Option("--counts", help="Store the number of neighbors of each point too.")] = False,
 ) -> None:
@@ -191,31 +149,41 @@ def export(
     with usage_errors():
         from experiments import _export, _layouts
 
-        _export.check(out)
+        _commands.check_ending(out, _export.ENDINGS)
         scene = _layouts.make(layout, spacing=spacing, dim=dim, seed=seed, fill=fill, dtype=dtype)
         typer.echo(_export.write(scene, take_file(out), counts))
 
 
-_BENCH = typer.Typer(cls=Bench, no_args_is_help=True, rich_markup_mode=None)
-app.add_typer(_BENCH, name="bench", short_help="Answer a question with a table: bench NAME.")
+def _add_group(name: str, text: str, module: str, there: dict[str, str]) -> None:
+    """Add a group of commands, each the function `command` of the module of its name."""
+    kind = _commands.those_of({each: (f"{module}.{each}", short) for each, short in there.items()})
+    app.add_typer(typer.Typer(cls=kind, no_args_is_help=True, rich_markup_mode=None), name=name, short_help=text)
 
 
-@app.command(short_help="Decide the hard cases on a GPU, take timings.")
-def gpu(
-    config: Annotated[Path, typer.Argument(help="GPU config, TOML.")],
-    out: Annotated[Path, typer.Option(help="Folder of the rows.")],
-) -> None:
-    """Decide every hard case on the GPU, then take all timings; rows are added to OUT/rows.jsonl one by one."""
-    with usage_errors():
-        from experiments import _config
-        from experiments.gpu import run
-        from experiments.gpu.config import Config
-
-        wrong = run.run(_config.load(config, Config), take_folder(out))
-        typer.echo(f"{wrong} wrong; rows in {out / 'rows.jsonl'}; python -m experiments report {out} makes a table of them")
-        if wrong:
-            raise typer.Exit(1)
-
-
-_SPH = typer.Typer(cls=Sph, no_args_is_help=True, rich_markup_mode=None)
-app.add_typer(_SPH, name="sph", short_help="Validate, time and differentiate the fluid solver.")
+_add_group(
+    *("bench", "Answer a question with a table: bench NAME.", "experiments.bench"),
+    {
+        "crystals": "Time batches of crystals in cells of their own.",
+        "distributed": "Time lists, sums and fluids on 1 to k devices.",
+        "arrays": "Time the array engine beside jax-md.",
+        "latency": "Time calls for few particles.",
+        "lj": "Time a Lennard-Jones liquid, beside jax-md, OpenMM and LAMMPS.",
+        "options": "Time each option of a search.",
+        "peers": "Ask other libraries for the hard cases.",
+        "start": "Time a fresh process up to its first result.",
+        "guides": "Time the code of each guide, and count what it compiles.",
+        "structures": "Time structures of atoms, one after another.",
+        "sums": "Measure one sum over neighbors in many ways.",
+        "ties": "Time lattices full of exact ties.",
+        "triangles": "Time the triangles that are near particles.",
+    },
+)
+_add_group(
+    *("sph", "Validate, time and differentiate the fluid solver.", "experiments.sph"),
+    {
+        "validate": "Run fluid scenes with known answers.",
+        "speed": "Time steps of a fluid scene.",
+        "gradients": "Solve inverse problems by gradients.",
+        "peers": "Time steps of solvers that others released.",
+    },
+)

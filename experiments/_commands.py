@@ -22,11 +22,11 @@ class Commands(TyperGroup):
     """Commands listed a line each; what is wrong with a command line is said in one line, with exit code 2.
 
     Attributes:
-        there: Of commands that are imported when they are run: module, function, and what they do. The function returns what is
-            printed; where it is stopped, the same command goes on.
+        there: Of commands that are imported when they are run: the module, whose function `command` returns what is printed, and
+            what it does; where it is stopped, the same command goes on.
     """
 
-    there: ClassVar[dict[str, tuple[str, str, str]]] = {}
+    there: ClassVar[dict[str, tuple[str, str]]] = {}
 
     def list_commands(self, ctx: Any) -> list[str]:  # noqa: ANN401
         """Return the names, in the order in which they were written down."""
@@ -36,9 +36,8 @@ class Commands(TyperGroup):
         """Return a command, after importing it where that has to be."""
         if cmd_name not in self.there:
             return super().get_command(ctx, cmd_name)
-        module, function, _ = self.there[cmd_name]
         app = typer.Typer(add_completion=False, rich_markup_mode=None)
-        app.command(name=cmd_name)(_make_command(getattr(importlib.import_module(module), function)))
+        app.command(name=cmd_name)(_make_command(importlib.import_module(self.there[cmd_name][0]).command))
         return typer.main.get_command(app)
 
     def format_help(self, ctx: Any, formatter: Any) -> None:  # noqa: ANN401
@@ -46,7 +45,7 @@ class Commands(TyperGroup):
         formatter.write(f"Usage: {ctx.command_path} COMMAND ...   (COMMAND --help says more)\n")
         for name in self.list_commands(ctx):
             command: Any = self.commands.get(name)
-            text = self.there[name][2] if command is None else command.get_short_help_str(66)
+            text = self.there[name][1] if command is None else command.get_short_help_str(66)
             formatter.write(f"  {name:<12}{text}\n")
 
     def main(self, args: Sequence[str] | None = None, *more: Any, standalone_mode: bool = True, **others: Any) -> Any:  # noqa: ANN401
@@ -58,6 +57,11 @@ class Commands(TyperGroup):
         except Exception as error:
             code = _report_error(error, sys.argv[1:] if args is None else args)
         sys.exit(code if isinstance(code, int) else 0)
+
+
+def those_of(there: dict[str, tuple[str, str]]) -> type[Commands]:
+    """Return what lists these commands, too."""
+    return type("Those", (Commands,), {"there": there})
 
 
 def _make_command(function: Callable[..., Any]) -> Callable[..., None]:
@@ -147,6 +151,12 @@ def check_names(kind: str, names: Sequence[str] | None, allowed: Iterable[str]) 
     allowed = list(allowed)
     if unknown := [name for name in names or () if name not in allowed]:
         raise UsageError(f"no {kind} {unknown[0]!r}; allowed: {', '.join(allowed)}")
+
+
+def check_ending(path: Path, allowed: Sequence[str]) -> None:
+    """Refuse a file whose ending names no format; see `check_choice`."""
+    if path.suffix not in allowed:
+        raise UsageError(f"--out {path}: unknown ending {path.suffix!r}; allowed: {', '.join(allowed)}")
 
 
 def take_folder(folder: Path, option: str = "--out") -> Path:

@@ -1,4 +1,4 @@
-"""Missing and extra pairs of a method against the oracle; padded rows against the tests' oracle, and against each other."""
+"""Missing and extra pairs of a method against the oracle."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -63,26 +63,6 @@ def compare_sample(found: Found, exact: np.ndarray, rows: np.ndarray, size: int)
         total = (len(found.pairs[0]) if found.total is None else found.total) // (2 if found.directed else 1)
     row = {"pairs": total, "exact_pairs": len(exact) // 2, "compared": "sample"}
     return row | {"missing": -(-missing // 2), "extra": -(-extra // 2)}
-
-
-def is_exact(oracle: Any, idx: Any, count: Any, fill: int, expected: Any) -> bool:  # noqa: ANN401
-    """Say whether padded rows, whose unused slots hold `fill`, hold exactly the pairs of the tests' oracle, each once."""
-    try:
-        found = oracle.pairs_of(np.asarray(idx), np.asarray(count), fill)
-    except AssertionError:  # indices out of range, or repeated
-        return False
-    return not any(oracle.compare(found, expected))
-
-
-def different_rows(one: Any, other: Any) -> int:  # noqa: ANN401
-    """Count the rows of two padded lists that differ as sets."""
-    import jax.numpy as jnp
-
-    different = 0
-    for start in range(0, len(one), 1 << 17):
-        part = slice(start, start + (1 << 17))
-        different += int((jnp.sort(one[part], axis=1) != jnp.sort(other[part], axis=1)).any(axis=1).sum())
-    return different
 
 
 def _keys(i: np.ndarray, j: np.ndarray, size: int) -> np.ndarray:

@@ -139,17 +139,7 @@ class Config(Repeats):
 
 
 @dataclass(frozen=True)
-class Keyed:
-    """What a row measures, and how."""
-
-    @property
-    def key(self) -> str:
-        """Digest of all fields, 12 hex digits: a row with the same key need not run again."""
-        return digest(asdict(self))
-
-
-@dataclass(frozen=True)
-class Spec(Keyed):
+class Spec:
     """What one row measures: a scene, a method, and how to measure it."""
 
     layout: str

@@ -4,8 +4,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-
-from experiments._errors import UsageError
+import pandas as pd
 
 if TYPE_CHECKING:
     from cases import Scene
@@ -13,16 +12,6 @@ if TYPE_CHECKING:
 ENDINGS = (".csv", ".vtp", ".vtk")
 NEIGHBORS = "neighbors"
 DIGITS = {np.dtype(np.float32): 9, np.dtype(np.float64): 17}  # enough to read the same float back
-
-
-def check(path: Path) -> None:
-    """Refuse a file whose ending names no format.
-
-    Raises:
-        UsageError: It is none of `ENDINGS`.
-    """
-    if path.suffix not in ENDINGS:
-        raise UsageError(f"--out {path}: unknown ending {path.suffix!r}; allowed: {', '.join(ENDINGS)}")
 
 
 def write(scene: "Scene", path: Path, counts: bool = False) -> Path:
@@ -39,24 +28,19 @@ def write(scene: "Scene", path: Path, counts: bool = False) -> Path:
     Returns:
         The path.
     """
-    neighbors = _count(scene) if counts else None
-    path.parent.mkdir(parents=True, exist_ok=True)
+    neighbors = None
+    if counts:
+        from experiments import _oracle
+
+        neighbors = _oracle.count_neighbors(_oracle.find_pairs(scene.positions, scene.cutoff), scene.n)
     (_write_csv if path.suffix == ".csv" else _write_vtk)(scene, path, neighbors)
     return path
 
 
-def _count(scene: "Scene") -> np.ndarray:
-    from experiments import _oracle
-
-    return _oracle.count_neighbors(_oracle.find_pairs(scene.positions, scene.cutoff), scene.n)
-
-
 def _write_csv(scene: "Scene", path: Path, neighbors: np.ndarray | None) -> None:
-    columns, formats = [scene.positions], [f"%.{DIGITS[scene.positions.dtype]}g"] * scene.dim
-    names = list("xyz"[: scene.dim])
-    if neighbors is not None:
-        columns, formats, names = [*columns, neighbors[:, None]], [*formats, "%d"], [*names, NEIGHBORS]
-    np.savetxt(path, np.hstack(columns), fmt=formats, delimiter=",", header=",".join(names), comments="")
+    frame = pd.DataFrame(scene.positions, columns=list("xyz"[: scene.dim]))
+    frame = frame if neighbors is None else frame.assign(**{NEIGHBORS: neighbors})
+    frame.to_csv(path, index=False, float_format=f"%.{DIGITS[scene.positions.dtype]}g")
 
 
 def _write_vtk(scene: "Scene", path: Path, neighbors: np.ndarray | None) -> None:

@@ -58,7 +58,7 @@ def bars(lines: Frame, ours: str, theirs: str, label: str, methods: Iterable[str
     title = f"{title}. First is {_first(lines, ours, methods)} here, {_first(lines, theirs, methods)} in the thesis"
     methods = [name for name in methods if (lines.method == name).any()]
     scenes = list(dict.fromkeys(lines.scene))
-    figure, axes = _axes(title, label, _look.WIDTH)
+    figure, axes = _axes(title, label)
     width = 0.8 / (2 * len(methods))
     for number, method in enumerate(methods):
         mine = lines[lines.method == method].set_index("scene").reindex(scenes)
@@ -68,7 +68,6 @@ def bars(lines: Frame, ours: str, theirs: str, label: str, methods: Iterable[str
         axes.bar(left + width, mine[theirs], width, **style, fill=False, hatch=HATCHES[method], label=f"{method}: thesis")
     axes.set_xticks(range(len(scenes)), scenes, rotation=30, ha="right")
     axes.set_ylim(top=8 * axes.get_ylim()[1])  # room for the legend
-    axes.yaxis.set_major_formatter(_look.PLAIN)
     axes.legend(fontsize=8, ncols=len(methods), loc="upper left", frameon=False)
     return figure
 
@@ -87,7 +86,7 @@ def split(lines: Frame, title: str) -> Figure:
     """Draw how the time of ANN with a list divides into counting, fetching and making the list, ours and the thesis's."""
     parts = {"t_ksearch": "#56B4E9", "t_frsearch": "#0072B2", "t_processing": "#E69F00"}
     mine = lines[lines.method == "ANN"].set_index("scene")
-    figure, axes = _axes(title, "time [s]", _look.WIDTH)
+    figure, axes = _axes(title, "time [s]")
     for side, (prefix, hatch) in enumerate((("", None), ("thesis_", "//"))):
         for number, (part, color) in enumerate(parts.items()):
             place = np.arange(len(mine)) + 0.4 * side - 0.4 + 0.13 * number
@@ -95,21 +94,19 @@ def split(lines: Frame, title: str) -> Figure:
             axes.bar(place, mine[prefix + part], 0.12, align="edge", color=color, hatch=hatch, edgecolor="white", label=label)
     axes.set_xticks(range(len(mine)), mine.index, rotation=30, ha="right")
     axes.set_ylim(top=30 * axes.get_ylim()[1])  # room for the legend
-    axes.yaxis.set_major_formatter(_look.PLAIN)
     axes.legend(fontsize=8, ncols=2, loc="upper left", frameon=False)
     return figure
 
 
 def over_fill(lines: Frame, ours: str, theirs: str, label: str, methods: Iterable[str], title: str) -> Figure:
     """Draw the mean over layouts for each fill, ours as a line and the thesis's dashed."""
-    figure, axes = _axes(title, label, _look.WIDTH)
+    figure, axes = _axes(title, label)
     for method in methods:
         means = lines[lines.method == method].groupby("fill")[[ours, theirs]].mean()
         axes.plot(means.index, means[ours], "o-", color=COLORS[method], label=f"{method}: ours")
         axes.plot(means.index, means[theirs], "o--", color=COLORS[method], markerfacecolor="white", label=f"{method}: thesis")
     axes.set(xscale="log", xlabel="fill [%]")
     axes.xaxis.set_major_formatter(_look.PLAIN)
-    axes.yaxis.set_major_formatter(_look.PLAIN)
     axes.legend(fontsize=8, frameon=False)
     return figure
 
@@ -123,17 +120,10 @@ def effect_bars(axes: Axes, made: Frame, factor: str, title: str) -> None:
     for number, value in enumerate(values):
         part = made[made[factor] == value]
         y = [methods.index(method) + 0.7 * ((number + 0.5) / len(values) - 0.5) for method in part.method]
-        color = _look.COLORS[number % len(_look.COLORS)]
+        color, marker = (of[number % len(of)] for of in (_look.COLORS, _look.MARKERS))
         axes.hlines(y, part.low, part.high, color=color, linewidth=1.5)
-        marker = _look.MARKERS[number % len(_look.MARKERS)]
-        axes.plot(
-            part.ratio,
-            y,
-            marker,
-            color=color,
-            markersize=5,
-            label=f"{factor} {value:g}" if isinstance(value, float) else str(value),
-        )
+        label = f"{factor} {value:g}" if isinstance(value, float) else str(value)
+        axes.plot(part.ratio, y, marker, color=color, markersize=5, label=label)
     axes.axvline(1, color="0.5", linewidth=0.8)
     axes.set_yticks(range(len(methods)), methods)
     axes.set_title(title, loc="left", fontsize=10)
@@ -154,10 +144,8 @@ def show(figure: Figure) -> None:
     display(Image(stream.getvalue()))
 
 
-def _axes(title: str, label: str, width: float) -> tuple[Figure, Axes]:
-    figure = Figure(figsize=(width, 4.5), layout="constrained")
-    axes = figure.add_subplot()
-    axes.set_title(fill(title, int(11 * width)), loc="left", fontsize=10)
+def _axes(title: str, label: str) -> tuple[Figure, Axes]:
+    figure, axes = _look.make_axes(title, 4.8)
     axes.set(yscale="log", ylabel=label)
-    axes.spines[["top", "right"]].set_visible(False)
+    axes.yaxis.set_major_formatter(_look.PLAIN)
     return figure, axes

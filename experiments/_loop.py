@@ -1,44 +1,34 @@
 """The loop of everything that measures: what is there is not measured again, and each row is on disk before the next one starts."""
 
+import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from datetime import UTC, datetime
 from typing import Any, Generic
 
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from tqdm import tqdm
 
 from experiments import _machine
 from experiments._rows import RETRIED, RowFile, RowT
 
 
-class Shown:
-    """What the user sees while it runs: a bar with a label, and lines above it."""
+class Shown(tqdm):
+    """What the user sees on stderr while it runs: a bar with a label and with time passed and left, and lines above it."""
 
-    def __init__(self, progress: Progress, total: int, completed: int = 0) -> None:
-        """Begin the bar."""
-        self._progress, self._bar = progress, progress.add_task("", total=total, completed=completed)
+    monitor_interval = 0  # no thread looks after it
+
+    def __init__(self, total: int, completed: int = 0) -> None:
+        """Begin the bar; of nothing there is none."""
+        words = "{n_fmt}/{total_fmt} {elapsed}<{remaining} {desc}"
+        super().__init__(total=total, initial=completed, file=sys.stderr, disable=total == 0, bar_format=words, mininterval=0)
 
     def label(self, text: str) -> None:
         """Say beside the bar what is going on."""
-        self._progress.update(self._bar, description=text)
+        self.set_description_str(text)
 
     def say(self, text: str) -> None:
         """Print a line above the bar."""
-        self._progress.console.print(text, highlight=False, markup=False, soft_wrap=True)
-
-    def advance(self, count: int = 1) -> None:
-        """Move the bar."""
-        self._progress.advance(self._bar, count)
-
-
-@contextmanager
-def show(total: int, completed: int = 0) -> Iterator[Shown]:
-    """Show a bar on stderr, with the time that has passed and, from the pace of the rows so far, the time that is left."""
-    columns = (BarColumn(16), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn(), TextColumn("{task.description}"))
-    with Progress(*columns, console=Console(stderr=True, force_jupyter=False), disable=total == 0) as progress:
-        yield Shown(progress, total, completed)
+        self.write(text, file=sys.stderr)
 
 
 @dataclass(frozen=True)
@@ -86,7 +76,7 @@ def fill(
         left = [task for task in tasks if any(key not in there or task.stale(there[key]) for key in task.keys)]
         total, missing = (sum(len(task.keys) for task in some) for some in (tasks, left))
         told = {"machine": _machine.machine(), **_machine.commit(), **(about or {})} if left else {}
-        with show(total, total - missing) as shown:
+        with Shown(total, total - missing) as shown:
             if missing < total:
                 shown.say(f"{total - missing} of {total} rows are there already")
             begin(left, shown)
@@ -106,7 +96,7 @@ def _measure(
         file.append(stamped)
         if (line := describe(stamped)) is not None:
             shown.say(line)
-    shown.advance(len(task.keys))
+    shown.update(len(task.keys))
 
 
 def in_parts(key: str, rows: Iterable[dict[str, Any]]) -> Iterator[dict[str, Any]]:

@@ -7,7 +7,7 @@ import math
 import os
 import resource
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from time import perf_counter, process_time
 from typing import Any
@@ -57,13 +57,6 @@ def forget_freed_memory() -> None:
         trim_threshold, mmap_threshold = -1, -3  # of malloc.h
         mallopt(mmap_threshold, 1 << 16)
         mallopt(trim_threshold, 0)
-
-
-def device_bytes(what: str) -> int | None:
-    """Return what JAX's allocator says of its first device, such as "bytes_in_use"; None where it says nothing."""
-    import jax
-
-    return (jax.devices()[0].memory_stats() or {}).get(what)
 
 
 class DeviceMemory:
@@ -192,32 +185,11 @@ def time_in_turns(calls: dict[str, Callable[[], Any]], rounds: int, burst: int =
     return seconds, None if others is None else round(others, 2)
 
 
-def time_kernels(launches: Sequence[Callable[[], Any]], repeats: int) -> list[float]:
-    """Return the seconds on CUDA, by the device's clock, of the first launch, of the first two, and so on: medians of graphs.
+def burst() -> int:
+    """Return how many calls of a device are timed as one: of one alone, much of the time is the host's."""
+    import jax
 
-    Args:
-        launches: Functions that launch on the current stream of the device.
-        repeats: How often each graph is timed, ten runs at a time.
-    """
-    from experiments._library import load_warp
-
-    wp = load_warp()
-
-    def measure(until: int) -> float:
-        with wp.ScopedCapture("cuda") as capture:
-            for launch in launches[:until]:
-                launch()
-        times = []
-        for _ in range(repeats):
-            begin, end = wp.Event("cuda", enable_timing=True), wp.Event("cuda", enable_timing=True)
-            wp.record_event(begin)
-            for _ in range(10):
-                wp.capture_launch(capture.graph)
-            wp.record_event(end)
-            times.append(wp.get_event_elapsed_time(begin, end) / 10 * 1e-3)
-        return float(np.median(times))
-
-    return [measure(k + 1) for k in range(len(launches))]
+    return 20 if jax.default_backend() == "gpu" else 1
 
 
 def summarize(seconds: list[float]) -> dict[str, Any]:

@@ -272,14 +272,8 @@ def _last(line: dict[int, float]) -> float:
 
 
 def _style(method: str, chosen: Sequence[str], size: float = 6.5) -> Any:  # noqa: ANN401
-    width = 2.0 if _look.is_ours(method) else 1.1
-    style = {
-        "color": _look.color_of(method, chosen),
-        "marker": _look.marker_of(method, chosen),
-        "markersize": size,
-        "linewidth": width,
-    }
-    return style | {"markeredgecolor": "white", "markeredgewidth": 0.6}
+    style = {"color": _look.color_of(method, chosen), "marker": _look.marker_of(method, chosen), "markersize": size}
+    return style | {"linewidth": 2.0 if _look.is_ours(method) else 1.1, "markeredgecolor": "white", "markeredgewidth": 0.6}
 
 
 def _draw_lines(axes: Axes, lines: Lines, chosen: Sequence[str]) -> None:

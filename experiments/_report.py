@@ -1,11 +1,13 @@
-"""The report of a sweep: reads its rows and nothing else; prints a short table, writes table.csv and pictures."""
+"""The report of a folder of rows, by what the first of them says; of a sweep a short table, table.csv and pictures."""
 
-import csv
+import json
 import math
 from collections.abc import Iterable
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
 from rich import box
 from rich.console import Console
 from rich.table import Table
@@ -13,13 +15,37 @@ from rich.text import Text
 
 from experiments import _table, methods
 from experiments._errors import UsageError
-from experiments._rows import SearchRow, read_latest
+from experiments._rows import RowFile, SearchRow, read_latest, read_text
 
+_KINDS = (  # columns by which rows are known, and the module of their report; others are those of a sweep
+    ({"figures", "curves"}, "experiments.sph.validate"),
+    ({"compensated", "way"}, "experiments.bench.sums"),
+    ({"scaling", "devices"}, "experiments.bench.distributed"),
+    ({"kind"}, "experiments.bench.table"),
+)
 PRINTED = ("s", "MB", "missing", "extra")
 ABSENT = "·"
 
 
+def kind_of(folder: Path) -> tuple[Any, str | None]:
+    """Return the kind of the rows of a folder, and the module of their report; None for a sweep, and where the first is no row."""
+    try:
+        columns = set(dict(json.loads(read_text(folder / "rows.jsonl").partition("\n")[0])))
+    except (OSError, TypeError, ValueError):
+        columns = set()
+    return next(((dict, module) for known, module in _KINDS if known <= columns), (SearchRow, None))
+
+
 def report(folder: Path) -> None:
+    """Print the tables of a folder, and write them and pictures beside the rows."""
+    kind, module = kind_of(folder)
+    if module is None:
+        report_sweep(folder)
+    else:
+        print(import_module(module).report(RowFile(folder, kind).read(), folder))
+
+
+def report_sweep(folder: Path) -> None:
     """Print the table of a sweep and the paths of its files: table.csv and the pictures, beside the rows.
 
     Raises:
@@ -32,10 +58,7 @@ def report(folder: Path) -> None:
 
     lines = _table.lines(rows)
     pictures = _plots.draw_all(_statistics.summarize(rows), folder, describe_origin(rows))
-    with (folder / "table.csv").open("w", encoding="utf-8", newline="") as stream:
-        writer = csv.DictWriter(stream, _table.COLUMNS)
-        writer.writeheader()
-        writer.writerows(lines)
+    pd.DataFrame(lines, columns=[*_table.COLUMNS], dtype=object).to_csv(folder / "table.csv", index=False, lineterminator="\r\n")
     console = Console(highlight=False, markup=False)
     if not console.is_terminal:
         console.width = 80

@@ -18,8 +18,11 @@ SCENE_FIELDS = ("spacing", "cutoff_ratio", "dtype", "dim", "seed", "angle", "gro
 
 
 @dataclass(kw_only=True)
-class Row:
-    """What every row says, whatever it measures; a study adds its columns. What was not reached is None."""
+class SearchRow:
+    """One method on one scene, measured in one process of its own; times are from raw positions to the result.
+
+    What was not reached is None.
+    """
 
     key: str  # digest of what is measured and how: rows with the same key replace each other
     status: str = "failed"  # or "ok", "missing", "timeout", "skipped"
@@ -31,28 +34,11 @@ class Row:
     commit: str | None = None  # of the project
     dirty: bool | None = None  # whether the working tree differed from it
     time: str | None = None  # when the row was finished, UTC
-
-    @property
-    def outcome(self) -> str:
-        """Status and reason, for a table."""
-        return (self.status if self.reason is None else f"{self.status}: {self.reason}")[:100]
-
-
-@dataclass(kw_only=True)
-class TimedRow(Row):
-    """A row with a time that is measured several times."""
-
     first_s: float | None = None  # first run, compilation included where it is not told apart [s]
     median_s: float | None = None  # of the repeats [s]
     p10_s: float | None = None
     p90_s: float | None = None
     repeats: int | None = None  # number of timed runs after the first
-
-
-@dataclass(kw_only=True)
-class SearchRow(TimedRow):
-    """One method on one scene, measured in one process of its own; times are from raw positions to the result."""
-
     layout: str
     method: str  # name of the adapter
     fill_asked: float | None  # share of the full domain that the config asked for
@@ -129,7 +115,7 @@ def name_scene(layout: str, fill: float | None) -> str:
     return layout if fill is None else f"{layout} {100 * fill:.4g} %"
 
 
-RowT = TypeVar("RowT")  # a dataclass that is a `Row`, or a dict
+RowT = TypeVar("RowT")  # a `SearchRow`, or a dict
 
 
 def values_of(row: Any) -> dict[str, Any]:  # noqa: ANN401

@@ -13,7 +13,6 @@ from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d.axes3d import Axes3D
 
 from experiments import _table
-from experiments._errors import UsageError
 
 if TYPE_CHECKING:
     from cases import Scene
@@ -23,15 +22,9 @@ COLOR = "#0072B2"
 RING_COLOR = "#D55E00"
 
 
-def check(path: Path) -> None:
-    """Refuse a picture whose ending names no format.
-
-    Raises:
-        UsageError: Names the formats that there are.
-    """
-    endings = sorted(f".{ending}" for ending in Figure().canvas.get_supported_filetypes())
-    if path.suffix not in endings:
-        raise UsageError(f"--out {path}: unknown ending {path.suffix!r}; allowed: {', '.join(endings)}")
+def endings() -> list[str]:
+    """Return the endings of pictures that can be drawn."""
+    return sorted(f".{ending}" for ending in Figure().canvas.get_supported_filetypes())
 
 
 def draw(scene: "Scene", path: Path) -> Path:
@@ -56,7 +49,6 @@ def draw(scene: "Scene", path: Path) -> Path:
         _draw_space(space, scene, points)
         layer, height = fullest_layer(points[:, 2], MILLI * scene.spacing)
         _draw_plane(plane, scene, points[layer], f"layer z = {height:.4g} mm, {_table.count(int(layer.sum()))} points")
-    path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=150)
     return path
 

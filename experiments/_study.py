@@ -1,11 +1,6 @@
 """What notebooks ask of the rows of sweeps: a table of rounds, and effects of one thing at a time with their uncertainty."""
 
-import gc
-import io
-import tempfile
 from collections.abc import Sequence
-from contextlib import redirect_stderr
-from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,66 +8,25 @@ import numpy as np
 import pandas as pd
 from scipy import stats
 
-from experiments import _config, _sweep, _table, _worker
-from experiments._config import Config, Scenes
+from experiments import _table
+from experiments._errors import UsageError
 from experiments._rows import SCENE_FIELDS, SearchRow, read_latest
 
-ROOT = Path(__file__).resolve().parent
+RESULTS = Path(__file__).parent / "results"
 Frame = Any  # a pd.DataFrame; what its columns hold, its annotations do not know
-LIGHT = ("cll", "scipy-kdtree", "scipy-kdtree-nolist", "ann-kd", "ann-kd-nolist", "nanoflann-dynamic", "nanoflann-rebuild")
-"""Methods whose processes start within a second."""
 
 
-def rows(sweep: str, results: str | None = None, *, small: bool = False) -> list[SearchRow]:
-    """Return the committed rows of a sweep, or, where there are none or `small` is asked for, rows of a small one made now.
+def rows(sweep: str) -> list[SearchRow]:
+    """Return the committed rows of a sweep, by the name of its folder below experiments/results.
 
-    Args:
-        sweep: Name of a config, such as sweep_orientation.
-        results: Folder below experiments/results; without it, that of the name.
-        small: Whether to measure a coarse lattice with few methods instead, all in this process: for tests.
+    Raises:
+        UsageError: There are none.
     """
-    folder = ROOT / "results" / (results or sweep)
-    if not small and (there := read_latest(folder)):
-        return there
-    if small:
-        return list(_measure(sweep))
-    config = shrink(_config.load(ROOT / "configs" / f"{sweep}.toml"))
-    with redirect_stderr(io.StringIO()):  # its progress is no result
-        made = _sweep.run(config, f"{sweep}, small", ROOT.parent / "out" / "small" / sweep)
-    command = f"python -m experiments run experiments/configs/{sweep}.toml --out {folder.relative_to(ROOT.parent)}"
-    print(f"no rows of {sweep} are here: what follows is a small version, measured now. `{command}` measures the whole one.")
-    return made
-
-
-@cache
-def _measure(sweep: str) -> tuple[SearchRow, ...]:
-    """Return rows of a small sweep, measured in this process, once however many ask for them."""
-    config = shrink(_config.load(ROOT / "configs" / f"{sweep}.toml"))
-    gc.freeze()  # a row collects garbage before it measures memory: what is imported is none, and slow to look through
-    try:
-        with tempfile.TemporaryDirectory() as out:
-            return tuple(_sweep.measure(spec, Path(out), _worker.measure(spec, Path(out))) for spec in config.specs())
-    finally:
-        gc.unfreeze()
-
-
-def shrink(config: Config) -> Config:
-    """Return a sweep of seconds that has the same axes: a coarse lattice, two values of each, light methods, two rounds."""
-    tables = [{name: _few(name, values) for name, values in table.model_dump().items()} for table in config.scenes[:2]]
-    scenes = tuple(Scenes.model_validate(table) for table in tables)
-    count = len([scene for table in scenes for scene in table.scenes()])
-    light = tuple(name for name in LIGHT if name in config.methods)[: 3 if count <= 4 else 2]
-    few: dict[str, Any] = {"processes": 2, "repeats": 3, "min_seconds": 0.0, "timeout": 60.0}
-    return config.model_copy(update={"scenes": scenes, "methods": light, "spacing": 2.5e-4, **few})
-
-
-def _few(axis: str, values: Sequence[Any]) -> tuple[Any, ...]:
-    """Return two layouts, two coarse spacings, one seed, of all else the first and the last value."""
-    if axis == "spacings" and values:
-        return (5e-4, 4e-4)
-    if axis == "seeds":
-        return tuple(values[:1])
-    return tuple(values[:2]) if axis == "layouts" or len(values) < 2 else (values[0], values[-1])
+    if not (found := read_latest(RESULTS / sweep)):
+        raise UsageError(
+            f"{RESULTS / sweep}: no rows; fill it with `python -m experiments run CONFIG.toml --out {RESULTS / sweep}`"
+        )
+    return found
 
 
 def table(found: list[SearchRow]) -> Frame:

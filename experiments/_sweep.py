@@ -136,7 +136,7 @@ def ask(task: dict[str, Any], timeout: float, *, cold: bool = True, kernels: Pat
     """
     with tempfile.TemporaryDirectory() as cache:
         where = {"WARP_CACHE_PATH": str(kernels or cache), "JAX_ENABLE_COMPILATION_CACHE": "false"}
-        # one pool from the start, see `_gpu.run`: else peaks on a GPU are those of whole pieces
+        # one pool from the start, see `bench.gpu`: else peaks on a GPU are those of whole pieces
         environment = os.environ | {"XLA_PYTHON_CLIENT_PREALLOCATE": "true", RUNNER: str(os.getpid())} | (where if cold else {})
         command = [sys.executable, "-m", "experiments._worker"]
         try:

@@ -35,8 +35,7 @@ class Figures:
 @cache
 def table() -> dict[tuple[str, int, str], Figures]:
     """Return Table 6.1 by layout, fill in percent and method."""
-    with FILE.open(encoding="utf-8", newline="") as stream:
-        rows = list(csv.DictReader(stream))
+    rows = csv.DictReader(FILE.read_text(encoding="utf-8").splitlines())
     return {
         (row["layout"], int(row["fill_percent"]), row["method"]): Figures(
             *(row["method"], int(row["points"]), float(row["t_total_s"]), float(row["memory_mb"])),

@@ -36,15 +36,11 @@ def main() -> None:
 
 
 def _answer(task: dict[str, Any]) -> dict[str, Any]:
-    """Do a task: {"do": "oracle" or "measure", "spec", "oracle": folder}, or {"do": "sum" or "sph", "spec"}."""
+    """Do a task: {"do": "oracle" or "measure", "spec", "oracle": folder}, or {"do": "sum", "spec"}."""
     if task["do"] == "sum":
         from experiments.bench import ways
 
-        return ways.measure(ways.Spec(**task["spec"]))
-    if task["do"] == "sph":
-        from experiments.sph import tradeoff
-
-        return tradeoff.measure(tradeoff.Spec(**task["spec"]))
+        return ways.measure(task["spec"])
     spec, folder = Spec(**task["spec"]), Path(task["oracle"])
     return prepare_oracle(spec, folder) if task["do"] == "oracle" else measure(spec, folder)
 

@@ -1,11 +1,13 @@
-"""Cell search on CUDA: seven or eight launches, no host synchronization, nothing allocated beside the scratch it is given.
+"""Cell search on CUDA: seven to ten launches, no host synchronization, nothing allocated beside the scratch it is given.
 
 bounds   lowest and highest coordinate per block
-lay_out  every block reduces those bounds to the grid, and clears its part of what the others count in
+lay_out  every block reduces those bounds to the grid, and clears its part of what the others count in; where a box of all sources
+         has too many cells, one without a few that are far from all others is taken, and these are sorted into its border
 count    every particle counts itself in its cell
 scan     counts to first places, in one pass (Merrill & Garland 2016, decoupled look-back)
 scatter  indices into their cells, in the order in which they came
 gather   positions into cell order, ranked by index within a cell: the same order in every run
+long     where few queries have longer cutoffs than cells are made for, what is near these is marked, 32 places in a bit
 query    a warp serves up to 32 neighboring queries, one per lane: candidates within reach of their box meet all of them, 32 in a
          block, float32 on tensor cores first; a neighbor is a bit, until the rows are written. Those that are far from each other
          it serves one after the other: where queries are few, they are shared among more warps
@@ -17,19 +19,21 @@ crossing the same in a periodic box, for queries whose reach leaves it: images t
 import functools
 from typing import NamedTuple
 
-from jfrnn.kernels._native import Kind, declare_kind, place_parts, table_cells
+from jfrnn.kernels._native import RULES, Kind, declare_kind, place_parts, table_cells
 from jfrnn.kernels._program import Entry, Kernel
 
 BLOCK = 256
 QUERY_BLOCK = 32  # one warp: others need not wait for it to end
 _PARTS = 256  # blocks of `bounds`; one thread of a block reads one part
-_PART = 10  # numbers of a part
+_PART = 9  # numbers of a part
+_LEFT_OUT = 16  # parts whose sources may lie outside of the box of cells on each side, where it would be too large else
 _TILE = 2048  # cells that a block of `scan` takes
 # How many warps few queries are shared among, at most. In which groups queries walk decides the order of rows and of sums, and the
 # number of shares the size of buffers that are laid out when a program is traced, maybe on another machine. So this is a property
 # of programs, not of the device: one with more or fewer multiprocessors runs as many warps, and gets the same bits. It is about 32
 # per multiprocessor of large GPUs; half and twice as many took longer on one of 132.
 _WARPS = 4096
+MOST_LONG = 16  # queries whose cutoffs are longer than that for which cells are made: all sources are asked whether they are near
 MOST_KINDS = 4  # species whose cutoffs tensor cores know; among more, a tree is searched
 # what all kernels of a search must agree on
 GRID = {
@@ -41,6 +45,8 @@ GRID = {
     "BLOCK": BLOCK,
     "WARPS": _WARPS,
     "MOST_KINDS": MOST_KINDS,
+    "MOST_LONG": MOST_LONG,
+    "LEFT_OUT": _LEFT_OUT,
 }
 HEADER_WORDS = 64  # of the scratch
 # Blocks of kernels that walk in strides, per multiprocessor: no result depends on how many there are.
@@ -92,6 +98,8 @@ class Kernels(NamedTuple):
     scan: Kernel
     scatter: Kernel
     gather: Kernel
+    find_long: Kernel | None
+    mark_long: Kernel | None
     query: Kernel
     crossing: Kernel | None
 
@@ -116,6 +124,9 @@ class Kernels(NamedTuple):
             if not of_queries or self.crossing is not None:
                 most = multiprocessors * _GATHERING[self.crossing is not None]
                 launches.append(Launch(self.gather, min(-(-size // BLOCK), most) * BLOCK, of_queries))
+        if self.find_long is not None and self.mark_long is not None:
+            launches.append(Launch(self.find_long, min(-(-max(m, n // 1024) // BLOCK), _SWEEP * multiprocessors) * BLOCK, False))
+            launches.append(Launch(self.mark_long, min(-(-n // BLOCK), _SWEEP * multiprocessors) * BLOCK, False))
         return launches
 
 
@@ -148,20 +159,29 @@ def walking_blocks(kind: Kind) -> int:
     return 24 if not kind.lists else 16 if kind.double else 20
 
 
+def has_long(kind: Kind) -> bool:
+    """Say whether some queries may have longer cutoffs than that for which cells are made."""
+    return kind.rule == RULES[0] and not kind.periodic and not kind.batched and not kind.tree
+
+
 @functools.lru_cache(512)
 def cell_kernels(kind: Kind) -> Kernels:
     """Return the kernels that sort by cell, and that list or count."""
     compiled, constants = kind.compiled(), {"LIST": kind.lists, "SUMS": 0, "LATER": kind.later, **GRID}
 
     def query_kernel(name: str, crossing: bool = False) -> Kernel:
-        where = {"CROSSING": crossing, "SHIFTED": kind.periodic if crossing else 0}
         entry = Entry("Rows.run", QUERY_BLOCK, walking_blocks(kind), "Rows_cross" * crossing)
-        return declare_kind(compiled, f"{name}_cuda", "rows.cuh", entry, cuda=True, constants=constants | where)[0]
+        return declare_kind(compiled, f"{name}_cuda", "rows.cuh", entry, cuda=True, constants=constants | {"CROSSING": crossing})[0]
 
     methods = ("find_bounds", "lay_out_grid", "count_cells", "scan_counts", "scatter_ids", "gather_places")
     stages = [Entry(f"Search.{method}", BLOCK) for method in methods]
     stages[-1] = stages[-1]._replace(blocks=_GATHERING[kind.periodic > 0])
     sorting = declare_kind(kind.only("periodic", "batched"), "cells_cuda", "cells.cuh", *stages, cuda=True, constants=GRID)
     bounds, lay_out, count, scan, scatter, gather = sorting
+    find_long = mark_long = None
+    if has_long(kind):
+        steps = [Entry(f"LongQueries.{method}", BLOCK) for method in ("find", "mark")]
+        of_rule = kind.only("scaled", "rule")
+        find_long, mark_long = declare_kind(of_rule, "long_cuda", "long.cuh", *steps, cuda=True, constants=GRID)
     crossing = query_kernel("crossing", crossing=True) if kind.periodic else None
-    return Kernels(bounds, lay_out, count, scan, scatter, gather, query_kernel("query"), crossing)
+    return Kernels(bounds, lay_out, count, scan, scatter, gather, find_long, mark_long, query_kernel("query"), crossing)

@@ -89,10 +89,9 @@ def sum_kernels(kind: Kind, term: TermText, key: str) -> Kernels:
     declare_one = functools.partial(declare_kind, kind.compiled(), cuda=True)
 
     def query_kernel(name: str, crossing: bool = False) -> Kernel:
-        where = {"CROSSING": crossing, "SHIFTED": kind.periodic if crossing else 0}
         entry = Entry("Sums.run", QUERY_BLOCK, blocks, "Sums_cross" * crossing)
         given = term_header(term, kind.double)
-        return declare_one(f"{name}_{key}", "pair_sum.cuh", entry, given=given, constants=constants | where)[0]
+        return declare_one(f"{name}_{key}", "pair_sum.cuh", entry, given=given, constants=constants | {"CROSSING": crossing})[0]
 
     sorting = Entry("SortValues.run", QUERY_BLOCK, 32)
     return Kernels(

@@ -3,6 +3,8 @@
 # pyright: reportInvalidTypeForm=false, reportAttributeAccessIssue=false, reportArgumentType=false
 # (what Warp's language is made of)
 
+from typing import Any
+
 import numpy as np
 import warp as wp
 
@@ -29,13 +31,7 @@ def _boxes_kernel(mesh: wp.uint64, points: wp.array(dtype=wp.vec3), cutoff: floa
 
 
 class Tree:
-    """A mesh on a device, and points that ask for it.
-
-    Attributes:
-        distance: What "nearest" wrote, infinite beyond the cutoff, shape [n].
-        count: What "boxes" wrote, shape [n].
-        launches: By these names: kernel, arguments, threads, and threads of a block.
-    """
+    """A mesh on a device, and points that ask for it."""
 
     def __init__(self, points: np.ndarray, vertices: np.ndarray, faces: np.ndarray, cutoff: float, device: str) -> None:
         """Build the tree.
@@ -49,19 +45,20 @@ class Tree:
         """
         corners = wp.array(vertices, dtype=wp.vec3, device=device)
         self._mesh = wp.Mesh(corners, wp.array(faces.reshape(-1).astype(np.int32), dtype=wp.int32, device=device))
-        asked, n = wp.array(points, dtype=wp.vec3, device=device), len(points)
-        self.distance, self.count = wp.empty(n, dtype=float, device=device), wp.empty(n, dtype=int, device=device)
-        self.launches = {
-            name: (kernel, [self._mesh.id, asked, cutoff, out], n, 256)
-            for name, kernel, out in (("nearest", _nearest_kernel, self.distance), ("boxes", _boxes_kernel, self.count))
-        }
+        given, n = [self._mesh.id, wp.array(points, dtype=wp.vec3, device=device), cutoff], len(points)
+        self._nearest = _nearest_kernel, n, [*given, wp.empty(n, dtype=float, device=device)]
+        self._boxes = _boxes_kernel, n, [*given, wp.empty(n, dtype=int, device=device)]
 
-    def launch(self, name: str) -> None:
-        """Launch a kernel by its name, on the current stream of the device."""
-        kernel, arguments, threads, block = self.launches[name]
-        wp.launch(kernel, threads, arguments, device=self.count.device, block_dim=block)
+    def nearest(self) -> wp.array:
+        """Return the distance of each point to the mesh, infinite beyond the cutoff, when the device has it, shape [n]."""
+        return _launch(*self._nearest)
 
-    def ask(self, name: str) -> np.ndarray:
-        """Launch a kernel by its name; return what it wrote."""
-        self.launch(name)
-        return self.launches[name][1][-1].numpy()
+    def boxes(self) -> wp.array:
+        """Return how many boxes of triangles are within the cutoff of each point, when the device has it, shape [n]."""
+        return _launch(*self._boxes)
+
+
+def _launch(kernel: wp.Kernel, threads: int, given: list[Any]) -> wp.array:
+    wp.launch(kernel, threads, given, device=given[-1].device, block_dim=256)
+    wp.synchronize_device(given[-1].device)
+    return given[-1]

@@ -10,7 +10,7 @@ import jax
 import typer
 
 from experiments import _machine
-from experiments.bench import first_page, start, table
+from experiments.bench import start, table
 
 GUIDES = start.ROOT / "docs" / "guides"
 COLUMNS = ("platform", "guide", "cache", "page_s", "programs", "compile_s", "kernels", "process_s", "status", "reason")
@@ -35,7 +35,7 @@ def _rows(page: Path) -> Iterator[table.Line]:
         kernels.mkdir()
         start.link(start.ROOT, packages)
         for cache in ("cold", "warm"):
-            row = start.run(first_page.__file__, str(page), packages, kernels, _FOUR if page.stem == "many-devices" else {})
+            row = start.run(str(page), packages, kernels, _FOUR if page.stem == "many-devices" else {})
             row |= {
                 "guide": page.stem,
                 "cache": cache,

@@ -10,6 +10,7 @@ from jax import Array
 
 import jfrnn
 from experiments._library import round_capacity
+from experiments.bench import ways
 
 LOOKED_AT = 50_000  # rows of a list in which distances are looked at, if there are more
 SUMMED = 2000  # particles whose sums are compared
@@ -133,15 +134,10 @@ def wrong_gradient(scene: Scene, found: tuple[Array, Array]) -> int:
 
 def _wrong_sums(scene: Scene, found: Any) -> int:  # noqa: ANN401
     """Count the chosen particles of which one sum or another is off."""
-    from scipy.spatial import KDTree
-
-    x, h = np.asarray(scene.x, np.float64), scene.cutoff
-    chosen, wrong = np.linspace(0, len(x) - 1, min(len(x), SUMMED)).astype(int), 0
-    away = [(x[row] - x[i]) / h for i, row in zip(chosen, KDTree(x).query_ball_point(x[chosen], h), strict=True)]
-    rest = [np.maximum(1 - np.square(r).sum(axis=1), 0) for r in away]
-    exact = [np.array([(each**3).sum() - 1 for each in rest])]  # a tree finds the particle itself, too
-    exact.append(np.array([12 / h * (each**2) @ r for each, r in zip(rest, away, strict=True)]))
-    for theirs, ours in zip(found, exact, strict=False):
+    n, h = len(scene.x), scene.cutoff
+    chosen, wrong = np.linspace(0, n - 1, min(n, SUMMED)).astype(int), 0
+    exact = ways.reference(ways.Given(scene.x, np.ones(n), h), chosen, True)[0] / ways.poly6_scale(h)
+    for theirs, ours in zip(found, (exact[:, 0], exact[:, 1:]), strict=False):
         near = np.abs(np.asarray(theirs)[chosen] - ours) <= 1e-5 * np.abs(ours).max()
         wrong += int((~near).reshape(len(chosen), -1).any(axis=1).sum())
     return wrong

@@ -15,8 +15,7 @@ import jfrnn
 from experiments import _measure, methods
 from experiments._commands import MOST_POINTS
 from experiments.bench import table
-from experiments.bench.lj_liquid import CUTOFF, STEP, Liquid, Ran, energy_of, kinetic_of, make_crystal
-from experiments.bench.lj_peers import PEERS, Asked
+from experiments.bench.lj_peers import CUTOFF, PEERS, STEP, Asked, Liquid, Ran, energy_of, kinetic_of, make_crystal
 from experiments.bench.lj_peers import rows as rows_of_peers
 
 SKINS = (0.1, 0.2, 0.3, 0.4, 0.6)

@@ -72,15 +72,11 @@ def _measure_option(row: table.Line, option: Option, n: int, rounds: int, backen
     row["beside_entries"] = its["entries"]
     both = {f"{what}_s": calls[what] for what in calls} | {f"beside_{what}_s": others[what] for what in calls}
     jax.block_until_ready([call() for call in both.values()])
-    seconds, row["others_cores"] = _measure.time_in_turns(both, rounds, _burst())
+    seconds, row["others_cores"] = _measure.time_in_turns(both, rounds, _measure.burst())
     row |= {name: float(np.median(found)) for name, found in seconds.items()}
     row |= {f"{what}_ratio": round(row[f"{what}_s"] / row[f"beside_{what}_s"], 2) for what in calls}
     if asked.peers:
         _ask_peers(row, asked, calls["count"], rounds)
-
-
-def _burst() -> int:
-    return 20 if jax.default_backend() == "gpu" else 1
 
 
 @functools.cache
@@ -144,7 +140,7 @@ def _ask_peers(row: table.Line, asked: Asked, ours: Callable[[], Any], rounds: i
         begin = perf_counter()
         jax.block_until_ready(theirs())
         once = perf_counter() - begin
-        burst = _burst() if once < 0.02 else 1
+        burst = _measure.burst() if once < 0.02 else 1
         turns = int(np.clip(PEER_SECONDS / (once * (burst + 1)), 2, rounds))
         seconds = _measure.time_in_turns({"ours": ours, "theirs": theirs}, turns, burst)[0]
         mine, its = (float(np.median(seconds[who])) for who in ("ours", "theirs"))

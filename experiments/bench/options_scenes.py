@@ -62,6 +62,7 @@ def beside(option: Option, asked: Asked, pairs: int) -> Asked:
 def options() -> list[Option]:
     """Return all options, the plain search first."""
     rest = [Option(name, functools.partial(_with, name)) for name in _KINDS]
+    rest.append(Option("ten far away", lambda n: _plain(n)._replace(x=jnp.asarray(_far(n)))))
     rest.append(Option("sum, the largest term", functools.partial(_sum_alone, _largest)))
     rest.append(Option("sum, a table indexed by species", functools.partial(_sum_alone, _by_species)))
     rest.append(Option("a cutoff per particle, equal", _equal, AS_MANY))

@@ -20,7 +20,7 @@ import typer
 
 from experiments import _machine, _measure
 from experiments._errors import UsageError
-from experiments.bench import first_result, table
+from experiments.bench import fresh, table
 
 WHAT = ("search", "gradient")
 PARTS = ("import_jax_s", "array_s", "import_jfrnn_s", "first_s", "again_s", "process_s")
@@ -79,17 +79,16 @@ def link(checkout: Path, packages: Path) -> None:
 
 def measure_process(what: str, packages: Path, kernels: Path) -> table.Line:
     """Return the columns of a process up to its first results, `search` or `gradient`."""
-    row = run(first_result.__file__, what, packages, kernels)
+    row = run(what, packages, kernels)
     return row | {"wait_s": row["import_jfrnn_s"] + row["first_s"]} if row["status"] == "ok" else row
 
 
-def run(program: str, asked: str, packages: Path, kernels: Path, more: dict[str, str] | None = None) -> table.Line:
-    """Run a program in a process that takes the library from one folder and keeps kernels in another, and return what it says.
+def run(asked: str, packages: Path, kernels: Path, more: dict[str, str] | None = None) -> table.Line:
+    """Run `fresh` in a process that takes the library from one folder and keeps kernels in another, and return what it says.
 
     Where the library takes a slower engine than it would choose, it warns, and the process fails.
 
     Args:
-        program: A file; its last line on standard output is a row as JSON.
         asked: Its argument.
         packages: A folder that `link` made.
         kernels: Where Warp keeps what it compiles.
@@ -99,7 +98,7 @@ def run(program: str, asked: str, packages: Path, kernels: Path, more: dict[str,
     environment = {name: value for name, value in os.environ.items() if name not in not_given}
     environment |= {"PYTHONPATH": str(packages), "WARP_CACHE_PATH": str(kernels), "CUDA_CACHE_PATH": str(kernels / "cuda")}
     environment |= more or {}
-    words = [sys.executable, "-P", "-W", "error::RuntimeWarning", program, asked]
+    words = [sys.executable, "-P", "-W", "error::RuntimeWarning", fresh.__file__, asked]
     begin, bystanders = perf_counter(), _measure.Bystanders()
     try:
         done = subprocess.run(words, capture_output=True, text=True, check=False, env=environment, cwd=kernels, timeout=_MOST_S)

@@ -106,7 +106,7 @@ def _rows(scene: str, sites: Callable[[], np.ndarray], dtype: DTypeLike, rounds:
     numbered = {f"{k} {what}": call for k, each in enumerate(calls) for what, call in each.items()}
     for call in numbered.values():
         jax.block_until_ready(call())
-    seconds, others = _measure.time_in_turns(numbered, rounds, 20 if jax.default_backend() == "gpu" else 1)
+    seconds, others = _measure.time_in_turns(numbered, rounds, _measure.burst())
     medians = np.median(list(seconds.values()), axis=1).reshape(len(placed), len(TIMED))
     for place, each, median in zip(placed, calls, medians, strict=True):
         count = np.asarray(each["count"]())

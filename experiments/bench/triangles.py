@@ -1,7 +1,7 @@
 """Particles around a gear: what `search_triangles` takes, beside libraries that find the nearest triangle of each point."""
 
 import importlib.util
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from time import process_time
@@ -20,12 +20,12 @@ from experiments.bench import table
 from jfrnn.cases import meshes
 
 COLUMNS = (
-    *("method", "n", "faces", "cutoff", "pairs", "longest_row", "rounds", "median_s", "p10_s", "p90_s", "us_per_particle"),
-    *("processor_s", "missing", "extra", "others_cores", "jax", "warp", "peer", "commit", "dirty"),
+    *("method", "n", "faces", "cutoff", "dtype", "pairs", "longest_row", "rounds", "median_s", "p10_s", "p90_s", "us_per_particle"),
+    *("processor_s", "missing", "extra", "others_cores", "device", "jax", "warp", "peer", "commit", "dirty"),
 )
 SHOWN = ("method", "n", "faces", "cutoff", "pairs", "median_s", "processor_s", "us_per_particle", "missing", "extra")
 _FEW = 2_000  # points that a peer is asked for whose time would be minutes
-_CURVES = ("row", "morton", "hilbert")
+_CURVES: tuple[Name, ...] = ("row", "morton", "hilbert")
 Faces = Annotated[list[int], typer.Option(min=100, max=10_000_000, help="Of gears, about; may be said several times.")]
 Cutoffs = Annotated[list[float], typer.Option(callback=positive, help="[modules]; may be said several times.")]
 
@@ -52,6 +52,7 @@ def command(
     cutoff: Cutoffs = [0.01, 0.03, 0.1, 0.3, 0.8],  # noqa: B006
     rounds: Rounds = 9,
     backend: Annotated[str, typer.Option(help="warp (beside bvh), bvh or jax.")] = "warp",
+    dtype: Annotated[str, typer.Option(help="Of positions: float32 or float64.")] = "float32",
 ) -> str:
     """Time the triangles of a gear that are near particles, beside trimesh and libigl where they are installed.
 
@@ -59,27 +60,30 @@ def command(
     anew, "morton order" and the like the first for points along a curve. Beside "warp" also "bvh", the same in a tree of boxes.
     Peers find the one nearest triangle of each point, however far, but for "wp.Mesh": "nearest" looks no farther than the cutoff,
     "boxes" only counts triangles whose boxes are as near, which is where a search through its tree of boxes begins; both run on one
-    core. `missing` and `extra` are particles of which jfrnn says otherwise than a peer, in float64, whether a triangle is near.
+    core of a CPU. On a GPU calls of jfrnn are not waited for one by one. `missing` and `extra` are particles of which jfrnn says
+    otherwise than a peer, in float64, whether a triangle is near.
     The module of gears is 1, their teeth are 20; points are random in their bounding boxes.
     """
     check_choice("--backend", backend, ("warp", "bvh", "jax"))
-    parts = [(f"{number} faces", partial(_gear_rows, points, number, cutoff, rounds, backend)) for number in faces]
-    given = [points, cutoff, rounds]
+    check_choice("--dtype", dtype, ("float32", "float64"))
+    jax.config.update("jax_enable_x64", dtype == "float64" or jax.config.read("jax_enable_x64"))
+    parts = [(f"{number} faces", partial(_gear_rows, points, number, cutoff, rounds, backend, dtype)) for number in faces]
+    given = [points, cutoff, rounds, dtype]
     return table.text(table.measure(out, f"{jax.default_backend()}_{backend}", parts, given, COLUMNS), SHOWN)
 
 
-def _gear_rows(n: int, faces: int, cutoffs: list[float], rounds: int, backend: Name) -> Iterator[table.Line]:
-    scene = gear(n, faces)
+def _gear_rows(n: int, faces: int, cutoffs: list[float], rounds: int, backend: Name, dtype: str) -> Iterator[table.Line]:
+    scene = _gear(n, faces)
     peers = {name: peer(scene) for name, peer in _PEERS.items() if importlib.util.find_spec(_MODULES[name])}
     for cutoff in cutoffs:
-        yield from _rows(scene, cutoff, rounds, backend, peers)
+        yield from ({"dtype": dtype} | row for row in _rows(scene, cutoff, rounds, backend, dtype, peers))
 
 
-def _rows(scene: _Scene, cutoff: float, rounds: int, backend: Name, peers: dict[str, _Asked]) -> Iterator[dict[str, Any]]:
+def _rows(scene: _Scene, cutoff: float, rounds: int, backend: Name, dtype: str, peers: dict[str, _Asked]) -> Iterator[table.Line]:
     engines = (backend, "bvh") if backend == "warp" else (backend,)
-    lists = {engine: _calls(scene, cutoff, engine) for engine in engines}
+    lists = {engine: _calls(scene, cutoff, engine, dtype) for engine in engines}
     calls = {f"{engine} {way}": call for engine, (calls, _) in lists.items() for way, call in calls.items()}
-    seconds, others = _measure.time_in_turns(calls, rounds)
+    seconds, others = _measure.time_in_turns(calls, rounds, _measure.burst())
     tri, n = lists[backend][1], len(scene.points)
     if any(np.any(np.asarray(other.count) != np.asarray(tri.count)) for _, other in lists.values()):
         raise RuntimeError(f"two engines count other triangles within {cutoff}: {', '.join(engines)}.")
@@ -98,7 +102,7 @@ def _rows(scene: _Scene, cutoff: float, rounds: int, backend: Name, peers: dict[
         yield common | row | _times_of(taken, len(asked), processor)
 
 
-def gear(n: int, faces: int) -> _Scene:
+def _gear(n: int, faces: int) -> _Scene:
     """Return random points around a gear."""
     vertices, named = meshes.gear(20, faces)
     vertices = vertices.astype(np.float32)
@@ -106,25 +110,20 @@ def gear(n: int, faces: int) -> _Scene:
     return _Scene(np.random.default_rng(0).uniform(low, high, (n, 3)).astype(np.float32), vertices, named)
 
 
-def _calls(scene: _Scene, cutoff: float, backend: Name) -> tuple[dict[str, Callable[[], Any]], jfrnn.TriangleList]:
-    x, vertices = jnp.asarray(scene.points), jnp.asarray(scene.vertices)
-    tri = jfrnn.search_triangles(x, vertices, jnp.asarray(scene.faces), cutoff, backend=backend)
-    calls = updates(tri, x, vertices, _CURVES)
-    jax.block_until_ready([call() for call in calls.values()])
-    return calls, tri
-
-
-def updates(tri: jfrnn.TriangleList, x: jax.Array, vertices: jax.Array, curves: Sequence[Name]) -> dict[str, Callable[[], Any]]:
+def _calls(scene: _Scene, cutoff: float, backend: Name, dtype: str) -> tuple[dict[str, Callable[[], Any]], jfrnn.TriangleList]:
     """Return compiled updates of a list by name: of a wall that stays or is sorted anew, counts, and particles along curves."""
+    x, vertices = jnp.asarray(scene.points, dtype), jnp.asarray(scene.vertices, dtype)
+    tri = jfrnn.search_triangles(x, vertices, jnp.asarray(scene.faces), cutoff, backend=backend)
     update = jax.jit(lambda x, tri: tri.update(x))
     rebuild = jax.jit(lambda x, vertices, tri: tri.update(x, vertices=vertices))
     count = jax.jit(lambda x, tri: tri.update(x).count)
     calls: dict[str, Callable[[], Any]] = {"update": lambda: update(x, tri), "rebuild": lambda: rebuild(x, vertices, tri)}
     calls["count"] = lambda: count(x, tri)
-    for curve in curves:
+    for curve in _CURVES:
         ordered = x[jfrnn.sort_order(x, tri.cutoff, curve=curve)]
         calls[f"update, {curve} order"] = lambda ordered=ordered: update(ordered, tri)
-    return calls
+    jax.block_until_ready([call() for call in calls.values()])
+    return calls, tri
 
 
 def _libigl(scene: _Scene) -> _Asked:
@@ -152,12 +151,12 @@ def _trees(scene: _Scene, cutoff: float) -> dict[str, _Asked]:
     from experiments.bench import bvh
 
     everyone = np.arange(len(scene.points))
-    tree = bvh.Tree(scene.points, scene.vertices, scene.faces, cutoff, "cpu")
-    found, seconds, processor = _repeat(lambda: tree.ask("nearest"))
-    _, taken, busy = _repeat(lambda: tree.ask("boxes"))
+    device = "cpu" if jax.default_backend() == "cpu" else "cuda:0"
+    tree = bvh.Tree(scene.points, scene.vertices, scene.faces, cutoff, device)
+    found, seconds, processor = _repeat(tree.nearest)
     return {
-        "wp.Mesh nearest": _Asked(everyone, found, seconds, processor),
-        "wp.Mesh boxes": _Asked(everyone[:0], found[:0], taken, busy),
+        "wp.Mesh nearest": _Asked(everyone, found.numpy(), seconds, processor),
+        "wp.Mesh boxes": _Asked(everyone[:0], np.empty(0), *_repeat(tree.boxes)[1:]),
     }
 
 

@@ -5,42 +5,15 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 from time import perf_counter, sleep
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from experiments import _layouts, _machine
-from experiments._config import Keyed
 from experiments._library import Name
 
 MOST_ROWS = 20_000  # whose error is looked at; of more particles, evenly chosen ones
-
-
-@dataclass(frozen=True)
-class Spec(Keyed):
-    """What one row measures, and how: fields as in a config of sums.
-
-    Attributes:
-        gradient: Density and gradient of the sum of all densities in the positions; else the density alone.
-        compensated: Rounding errors of the sums are carried along.
-        most_points: Larger scenes are skipped; None: none is.
-    """
-
-    layout: str
-    spacing: float
-    cutoff_ratio: float
-    dtype: str
-    seed: int
-    way: str
-    gradient: bool
-    compensated: bool
-    most_points: int | None
-    repeats: int
-    min_seconds: float
-    max_repeats: int
-    timeout: float
 
 
 class Given(NamedTuple):
@@ -67,11 +40,16 @@ class Way(NamedTuple):
     sums: bool = True  # else it only searches
 
 
+def poly6_scale(cutoff: float) -> float:
+    """Return what makes that kernel's integral 1."""
+    return 315 / (64 * math.pi * cutoff**3)
+
+
 def poly6(cutoff: float) -> Callable[[Any, Any, Any], Any]:
     """Return a density's kernel (Müller et al. 2003, doi:10.2312/SCA03/154-159) for `jfrnn.pair_sum`."""
     import jax.numpy as jnp
 
-    scale = 315 / (64 * math.pi * cutoff**3)
+    scale = poly6_scale(cutoff)
 
     def kernel(r: Any, i: Any, j: Any) -> Any:  # noqa: ANN401
         return j * scale * jnp.maximum(1 - r @ r / cutoff**2, 0.0) ** 3
@@ -102,7 +80,7 @@ def reference(given: Given, rows: np.ndarray, gradient: bool) -> tuple[np.ndarra
     place, j = np.repeat(np.arange(len(rows)), [len(row) for row in found]), np.concatenate([*found]).astype(np.int64)
     place, j = place[j != rows[place]], j[j != rows[place]]
     r = x[j] - x[rows[place]]
-    inside, scale = np.maximum(1 - (r**2).sum(axis=1) / h**2, 0), 315 / (64 * math.pi * h**3)
+    inside, scale = np.maximum(1 - (r**2).sum(axis=1) / h**2, 0), poly6_scale(h)
     terms = (m[j] * scale * inside**3)[:, None]
     if gradient:
         terms = np.hstack([terms, ((m[j] + m[rows[place]]) * scale * 6 / h**2 * inside**2)[:, None] * r])
@@ -128,37 +106,37 @@ def error_of(given: Given, found: Any, gradient: bool) -> float:  # noqa: ANN401
     return float((error[allowed > 0] / allowed[allowed > 0]).max(initial=0.0))
 
 
-def measure(spec: Spec) -> dict[str, Any]:
-    """Return the fields of the row that this process can know; a failure is a field too."""
-    way = WAYS[spec.way]
+def measure(spec: dict[str, Any]) -> dict[str, Any]:
+    """Return what this process can know of a row, a failure too; the spec is one of `sums.Config`."""
+    way, most = WAYS[spec["way"]], spec["most_points"]
     row: dict[str, Any] = {"versions": _machine.versions([way.package])}
     try:
         scene = _layouts.make(
-            spec.layout, spacing=spec.spacing, cutoff_ratio=spec.cutoff_ratio, dtype=spec.dtype, seed=spec.seed, fill=1.0
+            spec["layout"], fill=1.0, **{name: spec[name] for name in ("spacing", "cutoff_ratio", "dtype", "seed")}
         )
         row["points"] = n = len(scene.positions)
-        if spec.most_points is not None and n > spec.most_points:
-            return row | {"status": "skipped", "reason": f"{n} points; {spec.way} is run up to {spec.most_points}"}
+        if most is not None and n > most:
+            return row | {"status": "skipped", "reason": f"{n} points; {spec['way']} is run up to {most}"}
         _measure_way(way, spec, scene.positions, float(scene.positions.dtype.type(scene.cutoff)), row)
         row["status"] = "ok"
     except ImportError as error:
-        row |= {"status": "missing", "reason": f"{spec.way} cannot be imported: {error}"}
+        row |= {"status": "missing", "reason": f"{spec['way']} cannot be imported: {error}"}
     except Exception as error:  # whatever a way raises is the result of its row
         row |= {"status": "failed", "reason": f"{type(error).__name__}: {error}"[:600]}
     return row
 
 
-def _measure_way(way: Way, spec: Spec, positions: np.ndarray, cutoff: float, row: dict[str, Any]) -> None:
+def _measure_way(way: Way, spec: dict[str, Any], positions: np.ndarray, cutoff: float, row: dict[str, Any]) -> None:
     """Run once to compile, then for the time, once for the memory; fill the row as far as it comes."""
     import jax
 
     from experiments import _measure
 
-    jax.config.update("jax_enable_x64", spec.dtype == "float64")
-    masses = np.random.default_rng(spec.seed).uniform(0.5, 1.5, len(positions)).astype(positions.dtype)
+    jax.config.update("jax_enable_x64", spec["dtype"] == "float64")
+    masses = np.random.default_rng(spec["seed"]).uniform(0.5, 1.5, len(positions)).astype(positions.dtype)
     given = Given(jax.numpy.asarray(positions), jax.numpy.asarray(masses), cutoff)
-    used_before = _measure.device_bytes("bytes_in_use")
-    steps, building = way.prepare(given, spec.gradient, spec.compensated), []
+    device = _measure.DeviceMemory()
+    steps, building = way.prepare(given, spec["gradient"], spec["compensated"]), []
 
     def once() -> Any:  # noqa: ANN401
         begin = perf_counter()
@@ -171,14 +149,14 @@ def _measure_way(way: Way, spec: Spec, positions: np.ndarray, cutoff: float, row
     row["first_s"] = perf_counter() - begin
     building.clear()
     bystanders = _measure.Bystanders()
-    found, seconds = _measure.repeat(once, spec.repeats, spec.min_seconds, spec.max_repeats)
+    found, seconds = _measure.repeat(once, spec["repeats"], spec["min_seconds"], spec["max_repeats"])
     row |= {name: value for name, value in _measure.summarize(seconds).items() if name != "seconds"}
     row |= {"others_cores": bystanders.cores(), "cutoff": cutoff, "device": jax.devices()[0].device_kind}
     if steps.build is not None:
         row["build_s"] = float(np.median(building))
     row["sum_s"] = float(np.median(np.subtract(seconds, building)))
     if way.sums:
-        row["error"] = error_of(given, found, spec.gradient)
+        row["error"] = error_of(given, found, spec["gradient"])
     del found
     _measure.forget_freed_memory()
     once()
@@ -186,8 +164,8 @@ def _measure_way(way: Way, spec: Spec, positions: np.ndarray, cutoff: float, row
     memory = _measure.PeakMemory()
     once()
     row |= {"peak_bytes": memory.peak() - memory.start, "memory_source": memory.source}
-    if (peak := _measure.device_bytes("peak_bytes_in_use")) is not None:  # which is never forgotten; compiling does not raise it
-        row |= {"peak_bytes": peak - (used_before or 0), "memory_source": "memory_stats"}
+    if (peak := device.peak()) is not None:  # compiling does not raise it
+        row |= {"peak_bytes": peak, "memory_source": "device"}
 
 
 # --- the ways ---------------------------------------------------------------------------------------------------------
@@ -225,6 +203,13 @@ def _steps_without_list(backend: Name) -> Callable[[Given, bool, bool], Steps]:
     return prepare
 
 
+def _capacity(given: Given) -> int:
+    import jfrnn
+    from experiments._library import round_capacity
+
+    return round_capacity(int(jfrnn.count(given.x, given.cutoff).max()))
+
+
 def _our_list(given: Given) -> Callable[[Any], Any]:
     import jax
 
@@ -234,19 +219,6 @@ def _our_list(given: Given) -> Callable[[Any], Any]:
     return jax.jit(lambda x: jfrnn.search(x, cutoff, capacity=capacity))
 
 
-def _capacity(given: Given) -> int:
-    import jfrnn
-    from experiments._library import round_capacity
-
-    return round_capacity(int(jfrnn.count(given.x, given.cutoff).max()))
-
-
-def _steps_of_list(given: Given, gradient: bool, compensated: bool) -> Steps:
-    del compensated
-    kernel = poly6(given.cutoff)
-    return Steps(_our_list(given), _compile(lambda x, m, nbrs: over_list(kernel, x, m, nbrs.idx), gradient))
-
-
 def _our_flat_list(given: Given) -> Callable[[Any], Any]:
     import jax
 
@@ -254,6 +226,38 @@ def _our_flat_list(given: Given) -> Callable[[Any], Any]:
 
     total, cutoff = jfrnn.search_edges(given.x, given.cutoff).total, given.cutoff
     return jax.jit(lambda x: jfrnn.search_edges(x, cutoff, total=total))
+
+
+def _jax_md(given: Given) -> Callable[[Any], Any]:
+    from experiments.methods import jax_md
+
+    return jax_md.compile_update(given.x, given.cutoff)
+
+
+def _nvalchemi(given: Given) -> Callable[[Any], Any]:
+    import jax
+    import jax.numpy as jnp
+
+    from experiments.methods import nvalchemi
+
+    capacity = _capacity(given)
+    search = nvalchemi.compile_search(given.x, given.cutoff, capacity)
+
+    def build(x: Any) -> Any:  # noqa: ANN401
+        idx, count = search(x)
+        return jnp.where(jnp.arange(capacity) < count[:, None], idx, len(x))
+
+    return jax.jit(build)
+
+
+def _plain_sum_over(
+    make: Callable[[Given], Callable[[Any], Any]], rows: Callable[[Any], Any] = lambda idx: idx
+) -> Callable[[Given, bool, bool], Steps]:
+    def prepare(given: Given, gradient: bool, _: bool) -> Steps:
+        kernel = poly6(given.cutoff)
+        return Steps(make(given), _compile(lambda x, m, made: over_list(kernel, x, m, rows(made)), gradient))
+
+    return prepare
 
 
 def _pair_sum_over(make: Callable[[Given], Callable[[Any], Any]]) -> Callable[[Given, bool, bool], Steps]:
@@ -270,33 +274,7 @@ def _pair_sum_over(make: Callable[[Given], Callable[[Any], Any]]) -> Callable[[G
     return prepare
 
 
-def _jax_md(given: Given, gradient: bool, compensated: bool) -> Steps:
-    del compensated
-    from experiments.methods import jax_md
-
-    search, kernel = jax_md.compile_update(given.x, given.cutoff), poly6(given.cutoff)
-    return Steps(search, _compile(lambda x, m, idx: over_list(kernel, x, m, idx), gradient))
-
-
-def _nvalchemi(given: Given, gradient: bool, compensated: bool) -> Steps:
-    del compensated
-    import jax
-    import jax.numpy as jnp
-
-    from experiments.methods import nvalchemi
-
-    capacity, kernel = _capacity(given), poly6(given.cutoff)
-    search = nvalchemi.compile_search(given.x, given.cutoff, capacity)
-
-    def build(x: Any) -> Any:  # noqa: ANN401
-        idx, count = search(x)
-        return jnp.where(jnp.arange(capacity) < count[:, None], idx, len(x))
-
-    return Steps(jax.jit(build), _compile(lambda x, m, idx: over_list(kernel, x, m, idx), gradient))
-
-
-def _scipy(given: Given, gradient: bool, compensated: bool) -> Steps:
-    del gradient, compensated
+def _scipy(given: Given, *_: bool) -> Steps:
     from scipy.spatial import KDTree
 
     points = np.asarray(given.x, np.float64)
@@ -307,10 +285,10 @@ WAYS = {
     "pair_sum warp": Way(_steps_without_list("warp"), compensates=True),
     "pair_sum jax": Way(_steps_without_list("jax"), compensates=True),
     "brute force": Way(_steps_without_list("brute"), compensates=True),
-    "list, sum": Way(_steps_of_list),
+    "list, sum": Way(_plain_sum_over(_our_list, lambda nbrs: nbrs.idx)),
     "list, pair_sum": Way(_pair_sum_over(_our_list), compensates=True),
-    "jax-md list, sum": Way(_jax_md, "jax-md"),
-    "nvalchemi list, sum": Way(_nvalchemi, "nvalchemi-toolkit-ops"),
+    "jax-md list, sum": Way(_plain_sum_over(_jax_md), "jax-md"),
+    "nvalchemi list, sum": Way(_plain_sum_over(_nvalchemi), "nvalchemi-toolkit-ops"),
     "scipy pairs alone": Way(_scipy, "scipy", sums=False),
     "flat list, pair_sum": Way(_pair_sum_over(_our_flat_list), compensates=True),
 }

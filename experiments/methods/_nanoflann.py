@@ -27,11 +27,6 @@ def prepare(positions: np.ndarray, cutoff: float) -> Callable[[], np.ndarray]:
     return search
 
 
-def read_pairs(result: np.ndarray) -> Found:
-    """Return the unordered pairs, shape [m, 2]."""
-    return Found(result.nbytes, (result[:, 0], result[:, 1]))
-
-
 def follow(positions: np.ndarray, cutoff: float, motion: float, *, dynamic: bool) -> Callable[[], Result]:
     """Return `STEPS` steps of motion and search; the first of them builds the index."""
     rays, turn, (n, dim), at = directions(positions), turning_step(cutoff, motion), positions.shape, [0]

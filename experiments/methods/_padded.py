@@ -1,28 +1,45 @@
 """The library's padded full list, compiled once for the capacity that the scene needs."""
 
 from collections.abc import Callable
+from functools import partial
+from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 import jfrnn
 from experiments import _compare
 from experiments._library import Name
-from experiments.methods import Found
-from experiments.methods._compiled import compile_for
+from experiments.methods import Found, at_hand
 
 
-def allocate_backend(positions: np.ndarray, cutoff: float, backend: Name) -> int:
-    """Count the neighbors once, and return the length of the longest row."""
+def compile_for(function: Callable[..., Any], positions: np.ndarray, *more: jax.Array, kernels: bool = True) -> Callable[[], Any]:
+    """Compile `function(positions, *more)`, and return it; every call reads the positions anew and waits for the result.
+
+    With `kernels` of Warp it runs on one particle here: they compile when they first run, as does what makes an array.
+    """
     jax.config.update("jax_enable_x64", positions.dtype == np.float64)
-    return int(np.asarray(jfrnn.count(jax.numpy.asarray(positions), cutoff, backend=backend)).max(initial=0))
+    jitted = jax.jit(function)
+    given = (positions, *more)
+    compiled = jitted.lower(*(jax.ShapeDtypeStruct(values.shape, values.dtype) for values in given)).compile()
+    x = at_hand(positions)
+    if kernels:
+        jax.block_until_ready(jitted(*(jnp.asarray(values)[:1] for values in (x, *more))))
+    return lambda: jax.block_until_ready(compiled(jnp.asarray(x), *more))
 
 
-def prepare_backend(
-    positions: np.ndarray, cutoff: float, capacity: int, backend: Name, kernels: bool = False
-) -> Callable[[], jfrnn.NeighborList]:
-    """Compile the search, and return it."""
-    return compile_for(lambda x: jfrnn.search(x, cutoff, capacity=capacity, backend=backend), positions, kernels=kernels)
+def of_backend(backend: Name, kernels: bool = False) -> tuple[Callable[..., Any], Callable[..., Any], Callable[..., Any]]:
+    """Return `allocate`, `prepare` and `plan` of an engine's list; `kernels`: whether Warp compiles some for it."""
+
+    def allocate(positions: np.ndarray, cutoff: float) -> int:
+        jax.config.update("jax_enable_x64", positions.dtype == np.float64)
+        return int(np.asarray(jfrnn.count(jnp.asarray(positions), cutoff, backend=backend)).max(initial=0))
+
+    def prepare(positions: np.ndarray, cutoff: float, capacity: int) -> Callable[[], jfrnn.NeighborList]:
+        return compile_for(lambda x: jfrnn.search(x, cutoff, capacity=capacity, backend=backend), positions, kernels=kernels)
+
+    return allocate, prepare, partial(plan_backend, backend=backend)
 
 
 def plan_backend(positions: np.ndarray, cutoff: float, capacity: int | None = None, *, backend: Name) -> jfrnn.MemoryPlan:

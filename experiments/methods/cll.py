@@ -6,11 +6,12 @@ import numpy as np
 import warp as wp
 
 from experiments.methods import Found, _cll_kernels
+from experiments.methods._pairs import in_space, read_pairs
 
 
 def prepare(positions: np.ndarray, cutoff: float) -> Callable[[], wp.array]:
     """Return a search that links the cells, counts the pairs and lists them."""
-    points = np.pad(positions, ((0, 0), (0, 3 - positions.shape[1])))
+    points = in_space(positions)
     vector = wp.vec3f if points.dtype == np.float32 else wp.vec3d
 
     def search(points: np.ndarray = points) -> wp.array:
@@ -23,5 +24,4 @@ def prepare(positions: np.ndarray, cutoff: float) -> Callable[[], wp.array]:
 
 def read(result: wp.array) -> Found:
     """Return the pairs, shape [m, 2]."""
-    pairs = result.numpy()
-    return Found(pairs.nbytes, (pairs[:, 0], pairs[:, 1]))
+    return read_pairs(result.numpy())

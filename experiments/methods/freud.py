@@ -11,13 +11,14 @@ from freud import box as boxes  # pyright: ignore
 from freud import locality  # pyright: ignore
 
 from experiments.methods import Found
+from experiments.methods._pairs import in_space
 
 PACKAGES = ("freud-analysis",)
 
 
 def prepare(positions: np.ndarray, cutoff: float) -> Callable[[], Any]:
     """Return a search that sorts the particles and lists the pairs."""
-    points = np.pad(positions, ((0, 0), (0, 3 - positions.shape[1])))
+    points = in_space(positions)
     # around the origin, as its boxes are: to move the points instead would round them
     lengths: Any = [2 * float(most) + 3 * cutoff for most in np.abs(points).max(axis=0)]
     box = boxes.Box(*lengths)

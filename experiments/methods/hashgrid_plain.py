@@ -19,32 +19,6 @@ def allocate(positions: np.ndarray, cutoff: float) -> int:
     return int(prepare(positions, cutoff, 1)()[1].numpy().max(initial=0))
 
 
-def prepare(positions: np.ndarray, cutoff: float, capacity: int) -> Callable[[], tuple[Any, Any]]:
-    """Compile the kernel, and return the search."""
-    device = wp.get_preferred_device()
-    kernel = _hashgrid_kernels.list_neighbors_kernel
-    points = wp.array(positions.astype(np.float32, copy=False), dtype=wp.vec3, device=device)
-    grid = wp.HashGrid(*CELLS, device=device)
-
-    def search() -> tuple[Any, Any]:
-        idx = wp.empty((len(points), max(capacity, 1)), dtype=wp.int32, device=device)
-        count = wp.empty(len(points), dtype=wp.int32, device=device)
-        grid.build(points, cutoff)
-        wp.launch(kernel, dim=len(points), inputs=[grid.id, points, cutoff, capacity], outputs=[idx, count], device=device)
-        wp.synchronize_device(device)
-        return idx, count
-
-    search()
-    return search
-
-
-def read(result: tuple[Any, Any]) -> Found:
-    """Return the ordered pairs of the padded list."""
-    idx, count = (part.numpy() for part in result)
-    device = result[0].device
-    return found_in_rows(idx, count, device.name if device.is_cuda else "cpu")
-
-
 @dataclass
 class Counts:
     """Neighbors of each particle [n], on their way: `jax.block_until_ready` waits for them as for an array of JAX."""
@@ -55,6 +29,42 @@ class Counts:
         """Wait for the device."""
         wp.synchronize_device(self.array.device)
         return self
+
+
+def start(positions: np.ndarray, cutoff: float, capacity: int) -> Callable[[], tuple[Any, Counts]]:
+    """Compile the kernel, and return the search; a call does not wait."""
+    device = wp.get_preferred_device()
+    points = wp.array(positions.astype(np.float32, copy=False), dtype=wp.vec3, device=device)
+    grid = wp.HashGrid(*CELLS, device=device)
+
+    def search() -> tuple[Any, Counts]:
+        idx = wp.empty((len(points), max(capacity, 1)), dtype=wp.int32, device=device)
+        count = wp.empty(len(points), dtype=wp.int32, device=device)
+        grid.build(points, cutoff)
+        kernel = _hashgrid_kernels.list_neighbors_kernel
+        wp.launch(kernel, dim=len(points), inputs=[grid.id, points, cutoff, capacity], outputs=[idx, count], device=device)
+        return idx, Counts(count)
+
+    return search
+
+
+def prepare(positions: np.ndarray, cutoff: float, capacity: int) -> Callable[[], tuple[Any, Any]]:
+    """Compile the kernel, and return the search."""
+    begin = start(positions, cutoff, capacity)
+
+    def search() -> tuple[Any, Any]:
+        idx, count = begin()
+        return idx, count.block_until_ready().array
+
+    search()
+    return search
+
+
+def read(result: tuple[Any, Any]) -> Found:
+    """Return the ordered pairs of the padded list."""
+    idx, count = (part.numpy() for part in result)
+    device = result[0].device
+    return found_in_rows(idx, count, device.name if device.is_cuda else "cpu")
 
 
 def prepare_counts(positions: np.ndarray, cutoffs: np.ndarray) -> Callable[[], Counts]:

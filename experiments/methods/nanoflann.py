@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pynanoflann  # pyright: ignore[reportMissingImports]
 
-from experiments.methods import Found
+from experiments.methods._pairs import read_rows as read
 
 PACKAGES = ("pynanoflann",)
 
@@ -20,11 +20,3 @@ def prepare(positions: np.ndarray, cutoff: float) -> Callable[[], list[Any]]:
         return tree.radius_neighbors(positions, radius=cutoff, return_distance=False)
 
     return search
-
-
-def read(result: list[Any]) -> Found:
-    """Return the ordered pairs, less each particle with itself."""
-    i = np.repeat(np.arange(len(result)), [len(row) for row in result])
-    j = np.concatenate(result).astype(np.int64)
-    others = i != j
-    return Found(int(sum(row.nbytes for row in result)), (i[others], j[others]), directed=True)

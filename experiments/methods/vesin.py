@@ -6,11 +6,12 @@ times as long on 7 200 particles, and did not end on 250 000.
 
 import math
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 from vesin import NeighborList  # pyright: ignore
 
-from experiments.methods import Found
+from experiments.methods._pairs import in_space, read_ordered
 
 PACKAGES = ("vesin",)
 
@@ -19,15 +20,8 @@ def prepare(positions: np.ndarray, cutoff: float) -> Callable[[], tuple[np.ndarr
     """Return a search that lists the pairs."""
     scale = 2.0 ** -math.floor(math.log2(cutoff))
     search, box = NeighborList(cutoff=scale * cutoff, full_list=False), np.zeros((3, 3))  # pyright: ignore
-    points = _in_space(positions)
+    points = in_space(positions)
     return lambda: tuple(search.compute(points=scale * points.astype(np.float64), box=box, periodic=False, quantities="ij"))
 
 
-def read(result: tuple[np.ndarray, ...]) -> Found:
-    """Return the pairs."""
-    i, j = result
-    return Found(i.nbytes + j.nbytes, (np.asarray(i, np.int64), np.asarray(j, np.int64)))
-
-
-def _in_space(positions: np.ndarray) -> np.ndarray:
-    return np.pad(positions, ((0, 0), (0, 3 - positions.shape[1])))
+read = partial(read_ordered, directed=False)

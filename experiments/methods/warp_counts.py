@@ -9,8 +9,7 @@ import warp as wp  # without it this method is missing, which is no failure
 
 import jfrnn
 from experiments.methods import Found
-from experiments.methods._compiled import compile_for
-from experiments.methods._padded import plan_backend
+from experiments.methods._padded import compile_for, plan_backend
 
 plan = partial(plan_backend, backend="warp")
 

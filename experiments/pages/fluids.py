@@ -1,19 +1,13 @@
 """Tables of the fluid solver."""
 
+from functools import partial
+
 from experiments.pages.rows import RESULTS, markdown, number, one, read, whole
 
 
-def validation() -> str:
-    """Return what was measured of fluids with known answers."""
-    return _beside_answers([row for row in read("sph/table.csv") if row["case"] != "sedov"])
-
-
-def blast() -> str:
-    """Return what was measured of a blast in a gas."""
-    return _beside_answers([row for row in read("sph/table.csv") if row["case"] == "sedov"])
-
-
-def _beside_answers(rows: list[dict[str, str]]) -> str:
+def validation(blast: bool) -> str:
+    """Return what was measured of a blast in a gas, or of the fluids with known answers."""
+    rows = [row for row in read("sph/table.csv") if (row["case"] == "sedov") == blast]
     heads = ("case", "what is measured", ">measured", "target", "met", ">particles", ">steps", ">seconds", "on")
     names = ("case", "quantity", "measured", "target", "met", "particles", "steps", "seconds", "device")
     return markdown(heads, ([row[name] for name in names] for row in rows))
@@ -48,9 +42,12 @@ def ways() -> str:
         "jax-sph": "jax-sph's way: edges of jax-md, made anew in every step",
         "jax-sph, skin": "the same with that skin",
     }
-    rows = read("sph/speed_cpu/step.csv")
-    found = [(title, row) for way, title in titles.items() if (row := one(rows, way=way))]
-    lines = [[title, number(row["steps/s"]), number(row["faster"]), number(row["MB"])] for title, row in found]
+    rows = [row for row in read("sph/speed_cpu/rows.jsonl") if row["kind"] == "step"]
+    lines = []
+    for way, title in titles.items():
+        row = one(rows, way=way)
+        assert row is not None, way
+        lines.append([title, number(row["steps_per_s"]), number(row["median_s"] / rows[0]["median_s"]), number(row["bytes"], 1e-6)])
     return markdown(("way", ">steps/s", ">`pair_sum` is faster", ">MB"), lines)
 
 
@@ -96,16 +93,16 @@ def kept() -> str:
     """Return steps per second of sums that search, and of those over a list with a skin."""
     lines = []
     for folder, machine in (("speed_kept", "2 cores"), ("speed_kept_h100", "H100")):
-        rows = read(f"sph/{folder}/step.csv")
+        rows = [row for row in read(f"sph/{folder}/rows.jsonl") if row["kind"] == "step"]
         for particles in dict.fromkeys(row["particles"] for row in rows):
             pair = [one(rows, particles=particles, way=way) or {} for way in ("pair_sum", "list")]
-            lines.append([machine, whole(particles), *(number(row.get("steps/s")) for row in pair)])
+            lines.append([machine, whole(particles), *(number(row.get("steps_per_s")) for row in pair)])
     return markdown(("", ">particles with walls", ">`pair_sum`", ">over a list with a skin of 0.3 spacings"), lines)
 
 
 TABLES = {
-    "sph-validation": validation,
-    "sph-blast": blast,
+    "sph-validation": partial(validation, blast=False),
+    "sph-blast": partial(validation, blast=True),
     "sph-inverse": inverse,
     "sph-memory": reverse_memory,
     "sph-ways": ways,

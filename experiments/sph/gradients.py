@@ -2,15 +2,16 @@
 
 from pathlib import Path
 from time import perf_counter
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 import numpy as np
 import pandas as pd
+import typer
 from jax import Array
 from matplotlib.figure import Figure
 
-from experiments._commands import check_names
+from experiments._commands import check_names, take_folder
 from experiments._look import OURS, PEER, WIDTH, clear, dress, factor, head, make_axes, plain, write_names
 from experiments.sph.inverse import PROBLEMS, Found, Problem, solve
 from jfrnn.cases import fluids
@@ -20,19 +21,15 @@ from jfrnn.sph.model import Model, State, make_model, make_state
 NAMES = (*PROBLEMS, "memory")
 
 
-def run(names: list[str], folder: Path, evaluations: int = 25) -> str:
-    """Solve inverse problems, measure memory, write tables and pictures, and return the tables as text.
-
-    Args:
-        names: Of `NAMES`; all, where there are none.
-        folder: Gets NAME.csv and NAME.png.
-        evaluations: Of the loss of a problem, at most.
-
-    Raises:
-        UsageError: There is no such name.
-    """
+def command(
+    names: Annotated[list[str] | None, typer.Argument(help="viscosity, jet, droplet, memory; all without.")] = None,
+    out: Annotated[Path, typer.Option(help="Folder of tables and pictures.")] = Path("out") / "sph-gradients",
+    evaluations: Annotated[int, typer.Option(min=1, max=100_000, help="Runs to solve a problem with, at most.")] = 25,
+) -> str:
+    """Solve inverse problems by gradients through whole runs of a fluid, and measure the memory that such gradients take."""
+    jax.config.update("jax_enable_x64", True)
     check_names("problem", names, NAMES)
-    folder.mkdir(parents=True, exist_ok=True)
+    folder = take_folder(out)
     texts = []
     for name in names or NAMES:
         if name == "memory":

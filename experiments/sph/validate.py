@@ -1,53 +1,53 @@
 """Run scenes with known answers: a row per case, on disk before the next one starts; a table and pictures are made of the rows."""
 
 import math
-from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from time import perf_counter
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 import numpy as np
 import pandas as pd
+import typer
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Picture
 
 from experiments import _machine
-from experiments._commands import check_names
+from experiments._commands import check_names, take_folder
 from experiments._look import MARKERS, OURS, PEER, make_axes, write_names
 from experiments._loop import Task, fill
-from experiments._rows import Row, RowFile
+from experiments._rows import RowFile
 from experiments.sph.validation import CASES, Case, Curves, Seen, look
 from jfrnn.sph import health, solver
 from jfrnn.sph.model import make_model, make_state
 from jfrnn.sph.settings import SCENES
 
-
-@dataclass(kw_only=True)
-class CaseRow(Row):
-    """A case, whose name is the key; the reason says why there are no figures."""
-
-    figures: list[dict[str, Any]]  # what was measured: quantity, measured, low, high (what it has to be), met; none: it diverged
-    particles: int  # walls included
-    steps: int  # of the run
-    seconds: float  # of the run, compilation included
-    curves: Curves = field(default_factory=dict)  # what the picture shows, [x, y] by name
-    axes: tuple[str, str] = ("", "")  # of the picture
+Row = dict[str, Any]
 
 
-def run(names: list[str], folder: Path) -> list[CaseRow]:
-    """Run the cases that the folder does not hold yet, and return the rows of all that were asked for: all, where none are.
+def command(
+    cases: Annotated[list[str] | None, typer.Argument(help="Such as taylor-green, cavity; all, long ones last, without.")] = None,
+    out: Annotated[Path, typer.Option(help="Folder of the rows.")] = Path("out") / "sph-validate",
+) -> str:
+    """Run fluid scenes with known answers, or go on with them; then print a table, and draw pictures beside the rows."""
+    jax.config.update("jax_enable_x64", True)
+    check_names("case", cases, CASES)
+    tasks = [Task((name,), name, partial(_rows, name)) for name in cases or CASES]
+    rows = fill(RowFile(take_folder(out), dict), tasks, _in_words, about={"versions": _machine.versions()})
+    return report(rows, out)
 
-    Raises:
-        UsageError: There is no such case.
+
+def _rows(name: str, shown: Any) -> list[Row]:  # noqa: ANN401
+    return [measure(name, CASES[name], shown.label)]
+
+
+def measure(name: str, case: Case, say: Any = print) -> Row:  # noqa: ANN401
+    """Run a case and judge it; a run that diverges makes a row that says so.
+
+    The name is the row's key. `figures` are what was measured: quantity, measured, low, high (what it has to be), met; none of a
+    run that diverged. `seconds` are those of the run, compilation included; `curves` what the picture shows, [x, y] by name.
     """
-    check_names("case", names, CASES)
-    tasks = [Task((name,), name, lambda shown, name=name: [measure(name, CASES[name], shown.label)]) for name in names or CASES]
-    return fill(RowFile(folder, CaseRow), tasks, _in_words, about={"versions": _machine.versions()})
-
-
-def measure(name: str, case: Case, say: Any = print) -> CaseRow:  # noqa: ANN401
-    """Run a case and judge it; a run that diverges makes a row that says so."""
     make = SCENES[case.scene] if isinstance(case.scene, str) else case.scene
     scene = make(**case.settings)
     model, start, step, seen = make_model(scene, backend=case.backend, force=case.force), perf_counter(), 0, []
@@ -68,7 +68,7 @@ def measure(name: str, case: Case, say: Any = print) -> CaseRow:  # noqa: ANN401
     figures, curves = _judge(case, scene, seen) if reason is None else ([], {})
     about = {"particles": scene.n, "steps": step, "seconds": round(perf_counter() - start, 1), "axes": case.axes}
     about["device"] = jax.devices()[0].device_kind
-    return CaseRow(key=name, status="ok" if figures else "failed", reason=reason, figures=figures, curves=curves, **about)
+    return {"key": name, "status": "ok" if figures else "failed", "reason": reason, "figures": figures, "curves": curves} | about
 
 
 def _judge(case: Case, scene: Any, seen: list[Seen]) -> tuple[list[dict[str, Any]], Curves]:  # noqa: ANN401
@@ -77,36 +77,41 @@ def _judge(case: Case, scene: Any, seen: list[Seen]) -> tuple[list[dict[str, Any
     return [figure._asdict() | {"measured": number, "met": figure.met} for figure, number in measured], curves
 
 
-def report(rows: list[CaseRow], folder: Path) -> str:
+def report(rows: list[Row], folder: Path) -> str:
     """Write table.csv and a picture per case into the folder, and return the table as text."""
     frame = table(rows)
     frame.to_csv(folder / "table.csv", index=False)
     for row in rows:
-        if row.curves:
-            draw(row).savefig(folder / f"{row.key}.png", dpi=100)
+        if row["curves"]:
+            draw(row).savefig(folder / f"{row['key']}.png", dpi=100)
     return frame.to_string(index=False)
 
 
-def table(rows: list[CaseRow]) -> pd.DataFrame:
+def table(rows: list[Row]) -> pd.DataFrame:
     """Return a line per figure, and one for each case that has none."""
     lines = []
     for row in rows:
-        run_line = {"particles": row.particles, "steps": row.steps, "seconds": row.seconds, "device": row.device or "cpu"}
-        if not row.figures:
-            lines.append({"case": row.key, "quantity": row.reason, "measured": "", "target": "", "met": "no"} | run_line)
-        for figure in row.figures:
+        run_line = {
+            "particles": row["particles"],
+            "steps": row["steps"],
+            "seconds": row["seconds"],
+            "device": row.get("device") or "cpu",
+        }
+        if not row["figures"]:
+            lines.append({"case": row["key"], "quantity": row["reason"], "measured": "", "target": "", "met": "no"} | run_line)
+        for figure in row["figures"]:
             words = {"quantity": figure["quantity"], "measured": _number(figure), "target": _target(figure)}
-            lines.append({"case": row.key, **words, "met": "yes" if figure["met"] else "no"} | run_line)
+            lines.append({"case": row["key"], **words, "met": "yes" if figure["met"] else "no"} | run_line)
     return pd.DataFrame(lines)
 
 
-def draw(row: CaseRow) -> Picture:
+def draw(row: Row) -> Picture:
     """Draw what the particles do in color, as dots, and what is known in grey, as lines; of a dam break the other way round."""
-    broken = row.key.startswith("dam-break")
-    said = "; ".join(f"{x['quantity']}: {_number(x)} ({_target(x)})" for x in row.figures[: 1 if broken else 2])
-    figure, axes = make_axes(f"{row.key}. {said}" if said else row.key, 4.2)
-    shapes, ends = dict(zip(row.curves, MARKERS, strict=False)), []
-    for name, (x, y) in row.curves.items():
+    broken = row["key"].startswith("dam-break")
+    said = "; ".join(f"{x['quantity']}: {_number(x)} ({_target(x)})" for x in row["figures"][: 1 if broken else 2])
+    figure, axes = make_axes(f"{row['key']}. {said}" if said else row["key"], 4.2)
+    shapes, ends = dict(zip(row["curves"], MARKERS, strict=False)), []
+    for name, (x, y) in row["curves"].items():
         what, _, kind = name.rpartition(", ")
         color = OURS if kind == "measured" else PEER
         dots = (kind == "known") if broken else (kind == "measured")
@@ -116,9 +121,9 @@ def draw(row: CaseRow) -> Picture:
         if broken or not what:
             ends.append(("particles" if kind == "measured" else what or kind, x[-1], y[-1], color))
     write_names(axes, ends)
-    _name_pairs(axes, row.curves if not ends else {})
+    _name_pairs(axes, row["curves"] if not ends else {})
     key = "" if broken else "; dots: particles, lines: known"
-    axes.set(xlabel=f"{row.axes[0]}{key}", ylabel=row.axes[1])
+    axes.set(xlabel=f"{row['axes'][0]}{key}", ylabel=row["axes"][1])
     return figure
 
 
@@ -150,9 +155,9 @@ def _target(figure: dict[str, Any]) -> str:
     return f"≤ {figure['high']:g}" if figure["low"] is None else f"{figure['low']:g} to {figure['high']:g}"
 
 
-def _in_words(row: CaseRow) -> str:
-    if not row.figures:
-        return f"{row.key}: {row.reason}"
-    return f"{row.key}: " + "; ".join(
-        f"{x['quantity']} {_number(x)} ({_target(x)}: {'met' if x['met'] else 'missed'})" for x in row.figures
+def _in_words(row: Row) -> str:
+    if not row["figures"]:
+        return f"{row['key']}: {row['reason']}"
+    return f"{row['key']}: " + "; ".join(
+        f"{x['quantity']} {_number(x)} ({_target(x)}: {'met' if x['met'] else 'missed'})" for x in row["figures"]
     )

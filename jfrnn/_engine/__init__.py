@@ -3,7 +3,7 @@
 from jfrnn._engine.auto import ARRAYS, ENGINES, WARP, choose_engine, default_platform, fastest_engine, parse_backend, platform_of
 from jfrnn._engine.kept_warp import KeptList, kept_distances, kept_mask, kept_slopes, kept_sums
 from jfrnn._engine.launch import Call, Shapes, kernel
-from jfrnn._engine.operands import MOST_IN_BOX, as_float
+from jfrnn._engine.operands import MOST_IN_BOX, as_float, side_by_side
 from jfrnn._engine.plans import Clear, Launch, Plan, ask_for_huge_pages, share
 from jfrnn._engine.problem import (
     Engine,

@@ -30,10 +30,14 @@ def periodic_kind(lattice: Lattice | None) -> int:
 
 def particle_rows(points: Array, turns: Array | None, systems: Array | None) -> Array:
     """Return rows of particles as kernels read them: coordinates, packed turns, system number."""
-    columns, dim = [as_float(x, points.dtype) for x in (turns, systems) if x is not None], points.shape[1]
-    rows = jnp.pad(points, ((0, 0), (0, len(columns))))
-    for k, column in enumerate(columns):  # on a GPU, XLA's concatenation takes twice as long
-        rows = jnp.where(np.arange(rows.shape[1]) == dim + k, column[:, None], rows)
+    return side_by_side(points, [as_float(x, points.dtype) for x in (turns, systems) if x is not None])
+
+
+def side_by_side(first: Array, columns: list[Array]) -> Array:
+    """Return an array [n, k] with columns [n] behind its own; XLA's concatenation takes at least twice as long."""
+    rows = jnp.pad(first, ((0, 0), (0, len(columns))))
+    for k, column in enumerate(columns, first.shape[1]):
+        rows = jnp.where(np.arange(rows.shape[1]) == k, column[:, None], rows)
     return rows
 
 
@@ -110,6 +114,8 @@ def pack_particles(search: Search) -> tuple[Array, Array, Array]:
     if torus is not None:
         turns, query_turns = torus[1].turns, torus[1].query_turns
         numbers.append(lattice_numbers(torus[0], torus[1].reach, torus[1].slack))
+    if isinstance(cutoff, Cutoffs) and cutoff.longer is not None:
+        numbers.append(cutoff.longer.astype(sources.dtype)[None])
     if batch is not None:
         numbers.append(as_float(jnp.max(batch.of_all)[None], sources.dtype))
     sources = particle_rows(sources, turns, None if batch is None else batch.sources)

@@ -40,6 +40,7 @@ from jfrnn._engine.start import check_warp
 from jfrnn._geometry import Cutoffs
 from jfrnn._tracing import on_platform
 from jfrnn.kernels import Kernel, Kind, _driver, cells_cpu, cells_cuda, few_cuda, tree_cpu, tree_cuda
+from jfrnn.kernels._native import RULES
 
 PLATFORMS = {"cpu": "cpu", "gpu": "cuda", "cuda": "cuda"}  # names in JAX, names of branches
 _CELLS = {"cpu": cells_cpu, "cuda": cells_cuda}
@@ -49,6 +50,7 @@ QUERIES_PER_THREAD = 1024  # on the CPU, at least: among 1000, to wake a second 
 # each, and so many more for each source that is near. SAMPLED queries and sources tell. The first two were measured on an H200 for
 # a walker that trees have replaced, and that was slower: where a tree begins to be faster has not been measured.
 MOST_MET, MOST_MORE, SAMPLED = 2000, 8, (1024, 4096)
+OUTLYING = 3  # times the geometric mean of cutoffs: cells need not be as wide as few that are longer
 Given = Callable[[Search], dict[str, Array]]  # makes what kernels are given besides, by its names
 Found = TypeVar("Found")  # what a search or a sum returns
 
@@ -120,8 +122,38 @@ def has_order(engine: Engine, platform: str, n: int, plain: bool) -> bool:
 
 
 def by_cells_or_tree(cells: Callable[..., Found], tree: Callable[..., Found], search: Search, *more: tuple[Array, ...]) -> Found:
-    """Search on CUDA by cells as wide as the largest cutoff if cutoffs are alike, else in a tree."""
-    return lax.cond(cutoffs_are_alike(search), cells, tree, search, *more)
+    """Search on CUDA by cells as wide as the largest cutoff if cutoffs are alike, but for few, else in a tree."""
+    of_cells = search._replace(cutoff=cutoffs_of_most(search)) if has_long(search) else search
+
+    def by_cells(search: Search, largest: Array, longer: Array | None, *more: tuple[Array, ...]) -> Found:
+        return cells(search._replace(cutoff=dataclasses.replace(search.cutoffs, largest=largest, longer=longer)), *more)
+
+    def by_tree(search: Search, largest: Array, longer: Array | None, *more: tuple[Array, ...]) -> Found:
+        return tree(search, *more)
+
+    cutoffs = of_cells.cutoffs
+    return lax.cond(cutoffs_are_alike(of_cells), by_cells, by_tree, search, cutoffs.largest, cutoffs.longer, *more)
+
+
+def has_long(search: Search) -> bool:
+    """Say whether cells take queries whose cutoffs are longer than that for which they are made."""
+    return search.cutoffs.rule == RULES[0] and search.lattice is None and search.batch is None
+
+
+def cutoffs_of_most(search: Search) -> Cutoffs:
+    """Return the cutoffs with the largest one that is no outlier, if at most so many are that cells can serve these.
+
+    An outlier is OUTLYING times as long as the geometric mean of a sample, in which few outliers do not count for much.
+    """
+    cutoffs, radii = search.cutoffs, search.cutoffs.queries
+    assert radii is not None
+    sample = radii[:: -(-len(radii) // SAMPLED[0])]
+    most = OUTLYING * jnp.exp(jnp.mean(jnp.log(sample)))
+    longer = jnp.sum(radii > most, dtype=jnp.int32)
+    largest = jnp.max(jnp.where(radii > most, 0, radii), initial=0)
+    few = (longer <= cells_cuda.MOST_LONG) & (largest > 0)
+    largest, longer = jnp.where(few, largest, cutoffs.largest), jnp.where(few, longer, 0)
+    return dataclasses.replace(cutoffs, largest=largest, longer=longer)
 
 
 def cutoffs_are_alike(search: Search) -> Array:
@@ -141,7 +173,7 @@ def cutoffs_are_alike(search: Search) -> Array:
         radii = None if cutoffs.sources is None else cutoffs.sources[of_sources]
     else:
         radii = cutoffs.queries[of_queries][:, None]
-    volumes = (cutoffs.largest if radii is None else radii) / cutoffs.largest
+    volumes = (cutoffs.largest if radii is None else jnp.minimum(radii, cutoffs.largest)) / cutoffs.largest
     each = n / len(sources) / len(queries)
     found = jnp.sum(jnp.where(met, 1 - MOST_MORE * volumes**dim, 0))
     return (found * each <= MOST_MET) & (cutoffs.largest > 0)

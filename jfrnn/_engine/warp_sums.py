@@ -14,6 +14,7 @@ from jfrnn._engine.operands import (
     describe_sums,
     excluded_rows,
     kind_of_search,
+    names_of_cutoffs,
     names_of_tree,
     orders_for_tree,
     pack_particles,
@@ -59,8 +60,9 @@ def pair_sums(search: Search, keep: Filter, summed: Summed, values: tuple[Array,
                 results, dims = SumsOf(term, kind, m, few_cuda.slots(m)), {}
                 make, given = _few_callable(kind, term, key), [*values, *more]
             else:
-                orders = [*of_particles.values(), *orders_for_tree(search).values()] if tree else []
                 results, one = SumsOf(term, kind, m, pair_sum_cuda.slots(m)), kind._replace(tree=tree)
+                orders = list(of_particles.values()) if tree or cells_cuda.has_long(one) else []
+                orders += orders_for_tree(search).values() if tree else []
                 dims = {"values": max(pair_sum_cuda.sorted_numbers(term, n, kind.dim, double), 1)}
                 make, given = _cuda_callable(one, term, key), [*values, *sort_particles(one, particles, orders), *more]
             return results.unpack(*make(*particles, *given, output_dims=results.dims() | dims)[: len(SUMS)])
@@ -71,15 +73,16 @@ def pair_sums(search: Search, keep: Filter, summed: Summed, values: tuple[Array,
     return on_platform(search._replace(checks={}), values, late=bool(kind.rule), cpu=on(False), cuda=cuda)
 
 
-def sort_particles(kind: Kind, particles: tuple[Array, Array, Array], orders: list[Array]) -> Sequence[Array]:
+def sort_particles(kind: Kind, particles: tuple[Array, Array, Array], given: list[Array]) -> Sequence[Array]:
     """Sort particles on CUDA by a call of its own, which XLA makes once for a sum and its derivative; return what it wrote.
 
-    `orders` are what a tree is fitted to.
+    `given` are cutoffs that differ, and the orders that a tree is fitted to.
     """
     n, m = len(particles[0]), len(particles[1])
     words = (tree_cuda if kind.tree else cells_cuda).scratch_words(n, m, kind.dim, 2 if kind.double else 1, kind.own)
-    kind = kind.only("scaled", "own", "periodic", "batched", *(("rule", "tree") if kind.tree else ()))
-    return _sorting_callable(kind)(*particles, *orders, output_dims={"info": 2, "scratch": words})
+    more = ("rule", "tree") if kind.tree or cells_cuda.has_long(kind) else ()
+    kind = kind.only("scaled", "own", "periodic", "batched", *more)
+    return _sorting_callable(kind)(*particles, *given, output_dims={"info": 2, "scratch": words})
 
 
 @kernel
@@ -127,7 +130,7 @@ def _sorting_callable(kind: Kind) -> Call:
         stages = cells_cuda.cell_kernels(kind).stages(numbers["n"], numbers["m"], kind.own, multiprocessors)
         return Plan(place_launches(stages), numbers | more, ["idx", "count", "starts", "receivers"])
 
-    given = (*_GIVEN[:3], *names_of_tree(kind.rule) * kind.tree)
+    given = (*_GIVEN[:3], *(names_of_tree(kind.rule) if kind.tree else names_of_cutoffs(kind.rule)))
     return Call(f"jfrnn_sorting_cuda_{kind.name}", given, _WORDS, plan)
 
 

@@ -106,6 +106,7 @@ class Cutoffs:
         kinds: With a table, the cutoffs of pairs of species, [s, s], -1 for those that are no neighbors, and the species of the
             sources and of the queries. The cutoff of a particle is then the largest one of its species. Otherwise None.
         itself: Whether each particle is its own neighbor, whatever its cutoff. Static.
+        longer: [] how many queries have longer cutoffs than `largest`, if there may be some.
     """
 
     sources: Array | None
@@ -116,6 +117,7 @@ class Cutoffs:
     closed: bool = dataclasses.field(metadata={"static": True})
     kinds: tuple[Array, Array, Array] | None = None
     itself: bool = dataclasses.field(default=False, metadata={"static": True})
+    longer: Array | None = None
     scaled = True
 
     @property

@@ -23,6 +23,7 @@ from jfrnn._sums.terms import POSITIONS, Groups, Term, join
 from jfrnn._sums.translate import Ends, input_name, output_name, translate
 from jfrnn.kernels.pair_sum_cpu import Step, Sum, TermText, Value
 
+_FEW_COLUMNS = 4  # that are put behind those of an array one by one
 _Columns = tuple[tuple[int, int], ...]  # per column: the operand of a group and the element of it
 
 
@@ -265,6 +266,10 @@ def _pack(group: tuple, columns: _Columns, size: int | None, dtype: np.dtype) ->
         return jnp.zeros(1 if size is None else (1, 1), dtype)
     leading = () if size is None else (size,)
     flat = [engine.as_float(jnp.reshape(x, (*leading, -1)), dtype) for x in group]
+    first = columns[0][0]
+    whole, rest = columns[: flat[first].shape[-1]], columns[flat[first].shape[-1] :]
+    if size is not None and whole == tuple((first, e) for e in range(len(whole))) and len(rest) <= _FEW_COLUMNS:
+        return engine.side_by_side(flat[first], [flat[k][:, e] for k, e in rest])
     return jnp.concatenate([flat[k][..., e : e + 1] for k, e in columns], axis=-1)
 
 

@@ -76,10 +76,6 @@ def _wendland2_over_q(q: Array) -> Array:
     return -5 * (below(2, q) / 2) ** 3
 
 
-def _wendland2_derivative(q: Array) -> Array:
-    return q * _wendland2_over_q(q)
-
-
 def _wendland4(q: Array) -> Array:
     return (below(2, q) / 2) ** 6 * (35 / 12 * q**2 + 3 * q + 1)
 
@@ -88,20 +84,12 @@ def _wendland4_over_q(q: Array) -> Array:
     return -(7 / 3) * (2 + 5 * q) * (below(2, q) / 2) ** 5
 
 
-def _wendland4_derivative(q: Array) -> Array:
-    return q * _wendland4_over_q(q)
-
-
 def _wendland6(q: Array) -> Array:
     return (below(2, q) / 2) ** 8 * (4 * q**3 + 25 / 4 * q**2 + 4 * q + 1)
 
 
 def _wendland6_over_q(q: Array) -> Array:
     return -(11 / 4) * (2 + 7 * q + 8 * q**2) * (below(2, q) / 2) ** 7
-
-
-def _wendland6_derivative(q: Array) -> Array:
-    return q * _wendland6_over_q(q)
 
 
 def _poly6(q: Array) -> Array:
@@ -120,6 +108,10 @@ def _spiky_derivative(q: Array) -> Array:
     return -3 * below(1, q) ** 2
 
 
+def _wendland(norm: tuple[float, float], shape: Callable[[Array], Array], over_q: Callable[[Array], Array]) -> Kernel:
+    return Kernel(2.0, norm, shape, lambda q: q * over_q(q), _WENDLAND, over_q)
+
+
 _MONAGHAN = "Monaghan (1992), doi:10.1146/annurev.aa.30.090192.002551"
 _SCHOENBERG = "Schoenberg (1946) B-spline; Morris, Fox & Zhu (1997), doi:10.1006/jcph.1997.5776"
 _WENDLAND = "Wendland (1995), doi:10.1007/BF02123482; Dehnen & Aly (2012), doi:10.1111/j.1365-2966.2012.21439.x"
@@ -128,15 +120,9 @@ _MUELLER = "Müller, Charypar & Gross (2003), doi:10.2312/SCA03/154-159"
 KERNELS = {
     "cubic": Kernel(2.0, (10 / (7 * math.pi), 1 / math.pi), _cubic, _cubic_derivative, _MONAGHAN),
     "quintic": Kernel(3.0, (7 / (478 * math.pi), 1 / (120 * math.pi)), _quintic, _quintic_derivative, _SCHOENBERG),
-    "wendland2": Kernel(
-        2.0, (7 / (4 * math.pi), 21 / (16 * math.pi)), _wendland2, _wendland2_derivative, _WENDLAND, _wendland2_over_q
-    ),
-    "wendland4": Kernel(
-        2.0, (9 / (4 * math.pi), 495 / (256 * math.pi)), _wendland4, _wendland4_derivative, _WENDLAND, _wendland4_over_q
-    ),
-    "wendland6": Kernel(
-        2.0, (78 / (28 * math.pi), 1365 / (512 * math.pi)), _wendland6, _wendland6_derivative, _WENDLAND, _wendland6_over_q
-    ),
+    "wendland2": _wendland((7 / (4 * math.pi), 21 / (16 * math.pi)), _wendland2, _wendland2_over_q),
+    "wendland4": _wendland((9 / (4 * math.pi), 495 / (256 * math.pi)), _wendland4, _wendland4_over_q),
+    "wendland6": _wendland((78 / (28 * math.pi), 1365 / (512 * math.pi)), _wendland6, _wendland6_over_q),
     "poly6": Kernel(1.0, (4 / math.pi, 315 / (64 * math.pi)), _poly6, _poly6_derivative, _MUELLER),
     "spiky": Kernel(1.0, (10 / math.pi, 15 / math.pi), _spiky, _spiky_derivative, _MUELLER),
 }

@@ -5,7 +5,9 @@ from fractions import Fraction
 import jax
 import numpy as np
 import pytest
+import reference
 
+import jfrnn
 from jfrnn._geometry import cell_line as _cells
 from jfrnn._geometry.cutoffs import cutoff_range
 
@@ -73,3 +75,24 @@ def test_flushed_denormals_stay_within_the_edge_s_margin(dtype):
     """A negative denormal may count as 0 and land one cell up: the edge exceeds every cutoff by more than a denormal."""
     cutoff = dtype(np.nextafter(dtype(2 * cutoff_range(np.dtype(dtype))[0]), dtype(0)))
     assert Fraction(float(edge_of(cutoff, dtype))) - Fraction(float(cutoff)) > 2 * Fraction(float(np.finfo(dtype).tiny))
+
+
+@pytest.mark.parametrize("backend", ["warp", pytest.param("jax", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(("dtype", "dim", "away"), [(np.float32, 3, 1e4), (np.float64, 2, 1e200)])
+@pytest.mark.parametrize("order", ["shuffled", "along x"])
+def test_few_particles_far_from_all_others(dtype, dim, away, order, backend):
+    """A box of cells without them may be small enough where one with them is not; they have neighbors all the same."""
+    random, n, cutoff = np.random.default_rng(3), 6000, 0.05 if dim == 3 else 0.012
+    x = random.random((n, dim))
+    x[:24] = away * random.normal(size=(24, dim))
+    x[24:32] = x[:8] * (1 + 1e-7)  # closer than the cutoff at 1e4, if in float32 they are not alike, and never at 1e200
+    x[32:40] = x[32:40].round() + 0.3 * cutoff * random.normal(size=(8, dim))  # on both sides of the corners
+    x[40:43] = [np.r_[1e3, x[43, 1:]], np.r_[1e3 + 0.5 * cutoff, x[43, 1:]], np.r_[x[43, :-1], -1e3]]  # beside the box
+    x = (x if order == "shuffled" else x[np.argsort(x[:, 0])]).astype(dtype)
+    nbrs = jfrnn.search(x, cutoff, capacity=64, backend=backend)
+    expected = reference.reference_pairs(x, cutoff)
+    assert sorted(reference.pairs_of(np.asarray(nbrs.idx), np.asarray(nbrs.count), n)) == sorted(expected)
+    queries = np.concatenate([x[::7], 3 * x[::50], x[:40] + dtype(0.01)])
+    counts = np.asarray(jfrnn.count(x, cutoff, queries=queries, backend=backend))
+    found = [i for i, _ in reference.reference_pairs(x, cutoff, queries=queries)]
+    assert counts.tolist() == np.bincount(found, minlength=len(queries)).tolist()

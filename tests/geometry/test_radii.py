@@ -106,6 +106,49 @@ def each_case():
                 yield pytest.param(name, rule, dtype, dim, backend, way, id=kind, marks=[SLOW] * rarely)
 
 
+def with_few_longer(dtype, dim, factor, longer):
+    """Return points with cutoffs within a factor of 1.5, but for some that are longer by about a factor, some of them far away."""
+    random = np.random.default_rng(1)
+    x, cutoffs = random.random((200, dim)), 0.1 * random.uniform(1, 1.5, 200)
+    some = random.permutation(200)[:longer]
+    cutoffs[some] *= factor
+    away = some[::2]
+    x[away] = cutoffs[away, None] * random.uniform(-0.6, 0.6, (len(away), dim))
+    return x.astype(dtype), cutoffs.astype(dtype)
+
+
+@pytest.mark.parametrize("apart", [False, True], ids=["own", "queries"])
+@pytest.mark.parametrize(("dtype", "dim"), [(np.float32, 3), pytest.param(np.float64, 2, marks=SLOW)])
+def test_few_cutoffs_much_longer_than_the_rest(dtype, dim, apart):
+    """Cells are made for the others, and the few are served apart: as many as there may be, and one more, which a tree serves."""
+    capacity = 256
+
+    @jax.jit
+    def found(x, cutoffs, weights):
+        given = (x, cutoffs) if not apart else (x[50:], cutoffs[:150])
+        queries = {"queries": x[:150]} if apart else {}
+        nbrs = jfrnn.search(*given, capacity=capacity, backend="warp", **queries)
+        values = {"values": weights[50:], "query_values": weights[:150]} if apart else {"values": weights}
+        total = jfrnn.pair_sum(lambda r, i, j: j, *given, backend="warp", **queries, **values)
+        return nbrs.idx, nbrs.count, nbrs.status, jfrnn.count(*given, backend="warp", **queries), total
+
+    weights = np.arange(1, 201).astype(dtype)
+    for factor, longer in ((8, 16), (1e6, 10), (1e15, 3), (8, 17), (30, 1), (1, 1)):
+        x, cutoffs = with_few_longer(dtype, dim, factor, longer)
+        idx, count, status, counts, total = (np.asarray(each) for each in found(x, cutoffs, weights))
+        if apart:
+            expected = reference.reference_radii(x[50:], cutoffs[50:], "gather", queries=x[:150], query_radii=cutoffs[:150])
+        else:
+            expected = reference.reference_radii(x, cutoffs, "gather")
+        pairs = {pair[:2] for pair in expected}
+        assert int(status) == 0
+        assert sorted(reference.pairs_of(idx, count, len(x) - 50 * apart)) == sorted(pairs), (factor, longer)
+        assert counts.tolist() == np.bincount([i for i, _ in pairs], minlength=len(counts)).tolist()
+        weight, rows = weights[50:] if apart else weights, np.zeros(len(counts))
+        np.add.at(rows, [i for i, _ in pairs], [weight[j] for _, j in pairs])
+        assert total.tolist() == rows.tolist()
+
+
 @pytest.mark.parametrize(("name", "rule", "dtype", "dim", "backend", "way"), list(each_case()))
 def test_case(name, rule, dtype, dim, backend, way):
     often = way == "few" and rule in ("gather", "either", "mean") and name != "queries"  # the mask is a program of its own

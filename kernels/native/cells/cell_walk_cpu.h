@@ -128,7 +128,7 @@ struct CellWalk : Walk<Query> {
                 const whole most = grid.extent[k] - 1;
                 first[k] = first[k] < 0 ? 0 : first[k];
                 last[k] = last[k] > most ? most : last[k];
-                if constexpr (DIFFER) {  // sources beyond the grid are in the cells of its border
+                if (DIFFER || grid.more) {  // sources beyond the grid are in the cells of its border
                     first[k] = first[k] > most ? most : first[k];
                     last[k] = last[k] < 0 ? 0 : last[k];
                 }

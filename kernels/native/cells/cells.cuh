@@ -20,13 +20,15 @@ struct Shared {
     int behind[2];  // non-finite particles so far: sources, queries
     int tiles[2];   // tiles of the scan that have begun
     int crossing;   // blocks of queries that cross the box: the reach of one of them leaves it
-    float depth;    // how far a source from outside the box may be from its faces, in reaches: as far as they may be, queries cross
     real unit;      // of the lattice on which all coordinates lie, or 0
+    int longs;      // queries with longer cutoffs than cells are made for
+    int long_ids[MOST_LONG], long_places[MOST_LONG];
 };
 struct alignas(4 * sizeof(real)) Place {
     real p[3];
     real id;
 };  // id: the bits of an int
+static_assert(sizeof(Shared) <= 4 * 64, "the head of a scratch");
 constexpr unsigned int ALL = 0xffffffffu;
 
 // What a thread is: its number in its warp, the number of its warp in the block, the number of its block, and its number among all.
@@ -53,8 +55,9 @@ struct Scratch {
     int* query_start;
     unsigned long long* query_tile_state;
     int* query_order;
-    int* crossing;  // their numbers: nobody asks for keys and slots once particles are scattered
-    int* crosses;   // whether a block does
+    int* crossing;                   // their numbers: nobody asks for keys and slots once particles are scattered
+    int* crosses;                    // whether a block does
+    unsigned int* leaves_near_long;  // marks of long queries (long.cuh), which stand there, too
 
     Node* nodes;  // of a tree, which takes the place of the cells
 
@@ -78,6 +81,7 @@ struct Scratch {
         query_order = own ? order : take(m);
         crossing = key;
         crosses = slot;
+        leaves_near_long = (unsigned int*)slot;
     }
     JFRNN_FUNCTION long long up(long long words) { return (words + 15) & ~15ll; }
     JFRNN_MEMBER int* take(long long words) {
@@ -89,7 +93,6 @@ struct Scratch {
 
 JFRNN_FUNCTION int id_of(real bits) { return DOUBLE ? (int)__double_as_longlong(bits) : __float_as_int(bits); }
 JFRNN_FUNCTION real bits_as_real(int id) { return DOUBLE ? (real)__longlong_as_double(id) : (real)__int_as_float(id); }
-JFRNN_FUNCTION bool is_turned(const real* row) { return PERIODIC && Lattice::packed_turns(row[DIM]) != Lattice::NONE; }
 
 struct Search : SearchArguments, Cells, Thread, Shares, Scratch {
     const real INF;
@@ -100,27 +103,20 @@ struct Search : SearchArguments, Cells, Thread, Shares, Scratch {
           Scratch(given.scratch, given.n, given.m, given.own, given.table),
           INF(DOUBLE ? (real)__longlong_as_double(0x7ff0000000000000ll) : (real)__int_as_float(0x7f800000)) {}
 
-    // Of a point that comes from outside the box: how far from the nearest face it is, in reaches, rounded up.
-    JFRNN_MEMBER float depth_of(const real* at) const {
-        float depth = (float)INF;
-        for (int k = 0; k < DIM; ++k)
-            if (is_periodic(k))
-                depth = fminf(depth, 1.0001f * (float)((at[k] < real(0.5) ? at[k] : 1 - at[k]) / reach_along(k)));
-        return depth;
-    }
+    // Are there queries with longer cutoffs than cells are made for? The number stands behind all others.
+    JFRNN_MEMBER bool has_long_queries() const { return cutoff[LATTICE_END] > 0; }
+    // Where the marks of the k-th of them begin.
+    JFRNN_MEMBER long long words_of_long(int k) const { return k * ((n + 1023ll) / 1024); }
 
     // Reduces bounds, numbers of finite points and the bits that they have over all threads of a block, into those of its first thread.
-    JFRNN_MEMBER void reduce_over_block(real* low, real* high, int& finite, float& depth, int& lowest, int& highest) const {
+    JFRNN_MEMBER void reduce_over_block(real* low, real* high, int& finite, int& lowest, int& highest) const {
         __shared__ real lows[3][BLOCK / 32], highs[3][BLOCK / 32];
         __shared__ int finites[BLOCK / 32];
-        __shared__ float depths[BLOCK / 32];
         __shared__ int lowests[BLOCK / 32], highests[BLOCK / 32];
         lowest = __reduce_min_sync(ALL, lowest);
         highest = __reduce_max_sync(ALL, highest);
         for (int step = 16; step > 0; step /= 2) {
             finite += __shfl_down_sync(ALL, finite, step);
-            if constexpr (PERIODIC)
-                depth = fmaxf(depth, __shfl_down_sync(ALL, depth, step));
             for (int k = 0; k < DIM; ++k) {
                 const real l = __shfl_down_sync(ALL, low[k], step), h = __shfl_down_sync(ALL, high[k], step);
                 low[k] = l < low[k] ? l : low[k];
@@ -129,7 +125,6 @@ struct Search : SearchArguments, Cells, Thread, Shares, Scratch {
         }
         if (lane == 0) {
             finites[warp_in_block] = finite;
-            depths[warp_in_block] = depth;
             lowests[warp_in_block] = lowest;
             highests[warp_in_block] = highest;
             for (int k = 0; k < DIM; ++k) {
@@ -141,7 +136,6 @@ struct Search : SearchArguments, Cells, Thread, Shares, Scratch {
         if (threadIdx.x == 0)
             for (int w = 1; w < BLOCK / 32; ++w) {
                 finite += finites[w];
-                depth = fmaxf(depth, depths[w]);
                 lowest = lowests[w] < lowest ? lowests[w] : lowest;
                 highest = highests[w] > highest ? highests[w] : highest;
                 for (int k = 0; k < DIM; ++k) {
@@ -169,7 +163,6 @@ struct Search : SearchArguments, Cells, Thread, Shares, Scratch {
             high[k] = -INF;
         }
         int finite = 0, lowest = 1 << 20, highest = 0;
-        float depth = 0;
         for (long long i = thread; !own && i < m; i += threads)
             if (finite_point(queries + ROW * i))
                 look_at_bits(queries + ROW * i, lowest, highest);
@@ -183,10 +176,8 @@ struct Search : SearchArguments, Cells, Thread, Shares, Scratch {
             for (int k = 0; k < DIM; ++k)
                 at[k] = coordinate(k, p);
             widen(low, high, at, at);
-            if (is_turned(positions + ROW * i))
-                depth = fmaxf(depth, depth_of(at));
         }
-        reduce_over_block(low, high, finite, depth, lowest, highest);
+        reduce_over_block(low, high, finite, lowest, highest);
         if (threadIdx.x == 0) {
             real* part = parts + PART * block;
             for (int k = 0; k < DIM; ++k) {
@@ -194,28 +185,63 @@ struct Search : SearchArguments, Cells, Thread, Shares, Scratch {
                 part[3 + k] = high[k];
             }
             part[6] = bits_as_real(finite);
-            part[7] = depth;
-            part[8] = bits_as_real(lowest);
-            part[9] = bits_as_real(highest);
+            part[7] = bits_as_real(lowest);
+            part[8] = bits_as_real(highest);
         }
         if (thread == 0) {
-            shared.behind[0] = shared.behind[1] = shared.tiles[0] = shared.tiles[1] = shared.crossing = 0;
+            shared.behind[0] = shared.behind[1] = shared.tiles[0] = shared.tiles[1] = shared.crossing = shared.longs = 0;
             info[0] = info[1] = 0;
         }
     }
 
+    // Lays out a dense box without the sources of few parts that are farthest away along each axis, if there is one. These are sorted
+    // into the border, where they are mere candidates. `part` is that of this thread.
+    JFRNN_MEMBER void leave_out_few(Grid& grid, const real* part) {
+        __shared__ real ends[2][3][PARTS], low[3], high[3];
+        for (int k = 0; k < DIM; ++k) {
+            ends[0][k][threadIdx.x] = part[k];
+            ends[1][k][threadIdx.x] = -part[3 + k];
+        }
+        __syncthreads();
+        for (int side = 0; side < 2; ++side)
+            for (int k = 0; k < DIM; ++k) {
+                const real mine = ends[side][k][threadIdx.x];
+                int before = 0;
+                for (int p = 0; p < PARTS; ++p) {
+                    const real other = ends[side][k][p];
+                    before += other < mine || (other == mine && p < (int)threadIdx.x);
+                }
+                if (before == LEFT_OUT)
+                    (side ? high : low)[k] = side ? -mine : mine;
+            }
+        __syncthreads();
+        bool there_is = true;
+        for (int k = 0; k < DIM; ++k)
+            there_is = there_is && low[k] <= high[k] && high[k] < INF && low[k] > -INF;
+        if (threadIdx.x == 0 && there_is) {
+            Grid smaller;
+            lay_out(smaller, low, high, table);
+            if (smaller.dense) {
+                smaller.finite = grid.finite;
+                smaller.more = 1;
+                grid = smaller;
+                if (block == 0)
+                    shared.grid = grid;
+            }
+        }
+        __syncthreads();
+    }
     // Lets every block reduce those bounds to the grid, and clear its part of what the others count in.
     JFRNN_MEMBER void lay_out_grid() {
         __shared__ Grid grid;
         real low[3], high[3];
         const real* part = parts + PART * threadIdx.x;
-        int finite = id_of(part[6]), lowest = id_of(part[8]), highest = id_of(part[9]);
-        float depth = (float)part[7];
+        int finite = id_of(part[6]), lowest = id_of(part[7]), highest = id_of(part[8]);
         for (int k = 0; k < DIM; ++k) {
             low[k] = part[k];
             high[k] = part[3 + k];
         }
-        reduce_over_block(low, high, finite, depth, lowest, highest);
+        reduce_over_block(low, high, finite, lowest, highest);
         if (threadIdx.x == 0) {
             if (finite == 0)
                 for (int k = 0; k < DIM; ++k)
@@ -224,13 +250,14 @@ struct Search : SearchArguments, Cells, Thread, Shares, Scratch {
             grid.finite = finite;
             if (block == 0) {
                 shared.grid = grid;
-                shared.depth = depth;
                 shared.unit = lattice_unit(lowest, highest);
                 if (finite < n)
                     atomicOr(&info[1], 2);
             }
         }
         __syncthreads();
+        if (!grid.dense)
+            leave_out_few(grid, part);
         const int cells = grid.cells, tiles = (cells + 1) / TILE + 1;  // of the table, what is in use
         for (long long c = thread; c < cells + 2; c += threads) {
             start[c] = 0;
@@ -297,14 +324,14 @@ struct Search : SearchArguments, Cells, Thread, Shares, Scratch {
     // Puts positions into the order of cells, ranked by index within a cell: the same order in every run.
     JFRNN_MEMBER void gather_places() {
         const Grid grid = shared.grid;
-        real crossing_low[3], crossing_high[3];  // beyond, a query reaches out of the box, or may meet what comes from outside
+        real crossing_low[3], crossing_high[3];  // beyond, a query reaches out of the box
         for (int a = 0; a < DIM; ++a) {
-            const real reach = reach_along(a) * (real(1.00001) + real(shared.depth));  // rounding does no harm
+            const real reach = reach_along(a) * real(1.00001);  // rounding does no harm
             crossing_low[a] = is_periodic(a) ? reach : -INF;
             crossing_high[a] = is_periodic(a) ? real(0.999999) - reach : INF;
         }
-        auto mark = [&](const real* row, const real* p, long long place) {  // a query's block, if it crosses the box
-            bool crosses_box = is_turned(row);
+        auto mark = [&](const real* p, long long place) {  // a query's block, if it crosses the box
+            bool crosses_box = false;
 #pragma unroll
             for (int a = 0; a < DIM; ++a) {
                 const real x = coordinate(a, p);
@@ -319,9 +346,8 @@ struct Search : SearchArguments, Cells, Thread, Shares, Scratch {
         };
         for (long long place = thread; of_queries && place < shared.finite_queries; place += threads) {
             real p[3];
-            const real* row = queries + (long long)ROW * query_order[place];
-            point_of(row, p);
-            mark(row, p, place);
+            point_of(queries + (long long)ROW * query_order[place], p);
+            mark(p, place);
         }
         for (long long place = thread; !of_queries && place < n; place += threads) {
             const int i = order[place];
@@ -341,7 +367,7 @@ struct Search : SearchArguments, Cells, Thread, Shares, Scratch {
             }
             sorted[to] = mine;
             if (PERIODIC && own && cell >= 0)
-                mark(positions + (long long)ROW * i, mine.p, to);
+                mark(mine.p, to);
         }
     }
 };

@@ -16,6 +16,7 @@ struct Grid {
     int cells;      // entries of the table in use
     int dense;
     int finite;  // sources with finite coordinates
+    int more;    // whether sources lie outside of a dense box, in the cells of its border that are closest
 };
 
 // The exponent of a float's lowest bit: the float is a multiple of 2 to that. Zero is a multiple of everything.
@@ -184,6 +185,7 @@ struct Cells : Space {
             grid.extent[k] = extent <= table && !one_cell ? (int)extent : 1;
         }
         grid.dense = cells <= table;
+        grid.more = 0;
         grid.cells = grid.dense ? (int)cells : table;
     }
 };

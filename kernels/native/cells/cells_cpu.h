@@ -3,6 +3,9 @@
 #include "cells.h"
 #include "chunks.h"
 
+constexpr int SAMPLED = 256;        // cutoffs, and coordinates, that tell what is typical
+constexpr int MOST_OUTSIDE = 4096;  // sources outside of the box of cells, where a box of all would be too large
+
 struct Shared {
     Grid grid;
     int finite_queries;
@@ -102,6 +105,8 @@ struct Sort : SortArguments, Places {
                 for (int k = 0; k < DIM; ++k)
                     low[k] = high[k] = 0;
             lay_out(grid, low, high, table);
+            if (!grid.dense && !one_cell && n > 0)
+                leave_out_few(grid, low, high);
         }
         shared.next_chunk = 0;
         shared.next_gathered = shared.next_sorted = 0;
@@ -138,6 +143,59 @@ struct Sort : SortArguments, Places {
             widen(low, high, at, at);
         }
         return finite;
+    }
+
+    // Samples up to SAMPLED values, given by their numbers below `count`, and sorts them; NaN is left out. Returns how many there are.
+    template <class Value>
+    static int sample(int count, real* sampled, Value value_of) {
+        int found = 0;
+        for (int i = 0, step = (count - 1) / SAMPLED + 1; i < count; i += step) {
+            const real value = value_of(i);
+            int place = found;
+            found += value == value;
+            for (; value == value && place > 0 && sampled[place - 1] > value; --place)
+                sampled[place] = sampled[place - 1];
+            if (value == value)
+                sampled[place] = value;
+        }
+        return found;
+    }
+    // Narrows the box around all sources, where a few lie far away from the others: these are sorted into cells of its border.
+    void narrow(real* low, real* high) const {
+        for (int k = 0; k < DIM; ++k) {
+            real x[SAMPLED], p[3];
+            const int count = sample(n, x, [&](int i) {
+                point_of(positions + (long long)ROW * i, p);
+                return finite_point(p) ? coordinate(k, p) : Bits::no_number();
+            });
+            const int few = count / 64;
+            if (is_periodic(k) || few == 0)
+                continue;
+            const real first = x[few], last = x[count - 1 - few], beside = (last / 2 - first / 2) / 4;
+            low[k] = first - beside > low[k] ? first - beside : low[k];
+            high[k] = last + beside < high[k] ? last + beside : high[k];
+        }
+    }
+    // Lays out a dense box without the few sources that are far from all others, if there is one: there, no cell has more than these.
+    void leave_out_few(Grid& grid, real* low, real* high) const {
+        Grid smaller;
+        narrow(low, high);
+        lay_out(smaller, low, high, table);
+        int outside = 0;
+        for (int i = 0; smaller.dense && i < n; ++i) {
+            real p[3];
+            point_of(positions + (long long)ROW * i, p);
+            bool is_outside = false;
+            for (int k = 0; k < DIM && finite_point(p); ++k) {
+                const whole cell = axis_cell(smaller, k, coordinate(k, p));
+                is_outside |= cell < 0 || cell >= smaller.extent[k];
+            }
+            outside += is_outside;
+        }
+        if (!smaller.dense || outside > MOST_OUTSIDE || outside > n / 64)
+            return;
+        smaller.more = 1;
+        grid = smaller;
     }
 
     // The table of a system has at least so many entries: rows of cells are no longer than half of that, and share entries at one end.

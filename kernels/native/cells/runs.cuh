@@ -69,7 +69,10 @@ struct CellRuns {
             const int extent = lane < 2 ? grid.extent[0] : lane < 4 || DIM == 2 ? grid.extent[1] : grid.extent[2];
             const real from_low = x - (lane < 2 ? grid.low[0] : lane < 4 || DIM == 2 ? grid.low[1] : grid.low[2]);
             reached = from_low < 0 ? -1 : from_low < real(extent) ? (whole)from_low : (whole)extent;
-            reached = lane % 2 ? (reached < extent ? reached : extent - 1) : (reached < 0 ? 0 : reached);
+            if (grid.more || lane % 2)
+                reached = reached < extent ? reached : extent - 1;
+            if (grid.more || lane % 2 == 0)
+                reached = reached < 0 ? 0 : reached;
         } else
             reached = search.cell_number(x);
         return lane < 2 * DIM ? reached : 0;

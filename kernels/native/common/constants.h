@@ -30,7 +30,7 @@ constexpr bool COMPENSATED = true;          // sums are carried in twice the pre
 constexpr bool PACKED = false;   // what is near comes together first, so that the term is evaluated for hardly more than the pairs
 constexpr bool SKIPPED = false;  // the term is not evaluated for vectors without a pair
 // CUDA: what a search allocates, and how it is launched (see jfrnn/kernels/cells_cuda.py).
-constexpr int PARTS = 256, PART = 10, TILE = 2048, BLOCK = 256, WARPS = 4096;
+constexpr int PARTS = 256, PART = 9, LEFT_OUT = 16, TILE = 2048, BLOCK = 256, WARPS = 4096;
 constexpr bool LATER = false;     // only those neighbors that come after the query
 constexpr bool CROSSING = false;  // queries whose reach leaves a periodic box
 constexpr int TAKEN = 4;          // pairs that a lane evaluates at once
@@ -38,6 +38,7 @@ constexpr int PLACED = 3;         // coordinates of j before its numbers, in a r
 constexpr int ROW_LENGTH = 4;
 constexpr bool FROM_PLACES = false;  // the term reads coordinates of j, and no numbers
 constexpr int MOST_KINDS = 4;        // species whose cutoffs tensor cores know
+constexpr int MOST_LONG = 16;        // queries with longer cutoffs than cells are made for
 // Few particles on CUDA (see jfrnn/kernels/few_cuda.py).
 constexpr int FEW_MOST = 4096, FEW_WARPS = 32;
 // Searches with a cutoff per particle (see jfrnn/kernels/tree_cpu.py).
@@ -61,7 +62,7 @@ constexpr bool BOXES = false;     // each system has a lattice of its own
 // where the order of sources stands in a scratch.
 constexpr int BIT_NOT_FINITE = 2, BIT_OUT_OF_RANGE = 8, BIT_BOX_TOO_SMALL = 4;
 constexpr int FAR = 192, FAR_STEP = 256, FAR_MOST = 1 << 11, LARGEST_TURN = 511, MET_NOT_FINITE = 1 << 10, MET_TOO_FAR = 2 << 10;
-constexpr int FIRST_PLACE = 2624, PLACE_WORDS = 4, PLACE_WORD = 3;
+constexpr int FIRST_PLACE = 2368, PLACE_WORDS = 4, PLACE_WORD = 3;
 // Triangles (see jfrnn/kernels/_triangles.py, triangles_cpu.py and triangles_cuda.py).
 constexpr int LIMBS = 14, ROOM = 1202, STRIDE = 1;
 constexpr int MOST_CELLS = 8, MOST_ALONG = 64, MOST_ALONG_LOG2 = 6;

@@ -7,7 +7,6 @@
 #include "tree_cpu.h"
 
 constexpr int SAMPLES = 2048;  // queries that are asked how much they would meet
-constexpr int SAMPLED = 256;   // cutoffs, and coordinates, that tell what is typical
 constexpr int MOST_NEAR = 64;  // cells beyond which it is not counted how much the near ones hold
 constexpr int MOST_MET = 16;   // candidates for each pair, as an average, in cells
 
@@ -47,7 +46,7 @@ struct CutoffSort : TreeSortArguments {
         Grid grid;
         cells.lay_out(grid, low, high, table);
         if (!grid.dense && !cells.one_cell && n > 0) {
-            narrow(low, high);
+            cells.narrow(low, high);
             cells.lay_out(grid, low, high, table);
         }
         if (!grid.dense)
@@ -67,41 +66,10 @@ struct CutoffSort : TreeSortArguments {
             TreePlaces(*this).put_in_order(0, n);
         return true;
     }
-    // Samples up to SAMPLED values, given by their numbers below `count`, and sorts them; NaN is left out. Returns how many there are.
-    template <class Value>
-    static int sample(int count, real* sampled, Value value_of) {
-        int found = 0;
-        for (int i = 0, step = (count - 1) / SAMPLED + 1; i < count; i += step) {
-            const real value = value_of(i);
-            int place = found;
-            found += value == value;
-            for (; value == value && place > 0 && sampled[place - 1] > value; --place)
-                sampled[place] = sampled[place - 1];
-            if (value == value)
-                sampled[place] = value;
-        }
-        return found;
-    }
     real typical_cutoff() const {
         real r[SAMPLED];
-        const int count = sample(m, r, [&](int i) { return query_radii[i]; });
+        const int count = Sort::sample(m, r, [&](int i) { return query_radii[i]; });
         return count ? r[count * 15 / 16] : cells.radius;
-    }
-    // Narrows the box around all sources, where a few lie far away from the others: these are sorted into cells of its border.
-    void narrow(real* low, real* high) const {
-        for (int k = 0; k < DIM; ++k) {
-            real x[SAMPLED], p[3];
-            const int count = sample(n, x, [&](int i) {
-                cells.point_of(positions + (long long)ROW * i, p);
-                return finite_point(p) ? cells.coordinate(k, p) : Bits::no_number();
-            });
-            const int few = count / 64;
-            if (cells.is_periodic(k) || few == 0)
-                continue;
-            const real first = x[few], last = x[count - 1 - few], beside = (last / 2 - first / 2) / 4;
-            low[k] = first - beside > low[k] ? first - beside : low[k];
-            high[k] = last + beside < high[k] ? last + beside : high[k];
-        }
     }
     // Do queries meet few sources in the cells that they look into, beyond those that are near? As many are in the cells beside that
     // of a query as there are in its own, it is supposed.

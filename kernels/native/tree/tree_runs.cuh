@@ -1,6 +1,6 @@
 // The leaves of a tree within reach of a group, and the runs of candidates that they hold.
 #pragma once
-#include "runs.cuh"
+#include "marked_runs.cuh"
 
 struct TreeRuns {
     int root, level, node;     // the node whose children are visited
@@ -166,12 +166,12 @@ struct TreeRuns {
 };
 
 // Where the candidates of a group come from.
-template <bool>
-struct Provider {
-    using Runs = TreeRuns;
+template <bool, class Yes, class No>
+struct Choice {
+    using Type = Yes;
 };
-template <>
-struct Provider<false> {
-    using Runs = CellRuns;
+template <class Yes, class No>
+struct Choice<false, Yes, No> {
+    using Type = No;
 };
-using Runs = Provider<TREE>::Runs;
+using Runs = Choice<TREE, TreeRuns, Choice<LONG, MarkedRuns, CellRuns>::Type>::Type;

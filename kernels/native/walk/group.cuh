@@ -14,6 +14,7 @@ struct Group {
     int my_id;
     real my_place[3];  // along the axes of cells
     unsigned int system;
+    bool is_long;         // cells do not know what is near
     real bound;           // of lane 2a the group's lowest coordinate along axis a, of lane 2a + 1 the highest
     real largest;         // where cutoffs differ: beyond, none of the queries has a neighbor
     real unit, scale;     // coordinates from the center are multiplied by both
@@ -23,7 +24,7 @@ struct Group {
     // Takes the queries from `place` on that share a row of cells with the first one, and a system, and are not too far from it; of a
     // tree, how many of them walk together is decided later (tree_runs.cuh).
     JFRNN_MEMBER Group(const PairSearch& search, int place, int stop)
-        : place(place), mine{{0, 0, 0}, 0}, my_place{0, 0, 0}, system(0) {
+        : place(place), mine{{0, 0, 0}, 0}, my_place{0, 0, 0}, system(0), is_long(false) {
         const Known& known = shared_known();
         const int lane = search.lane;
         bool beside = place + lane < stop && (TREE || place + lane < known.finite_queries);
@@ -40,6 +41,13 @@ struct Group {
             my_place[a] = search.coordinate(a, mine.p);
             const whole here = search.axis_cell(known.grid, a, my_place[a]), there = __shfl_sync(ALL, here, 0);
             beside = beside && (a == 0 ? known.grid.dense || (here >= there && here - there < 2 * REACH_X) : here == there);
+            if (a == 0 && known.grid.more)  // what lies outside of the box is far from what does not
+                beside = beside && (here < 0) == (there < 0) && (here < known.grid.extent[0]) == (there < known.grid.extent[0]);
+        }
+        if (LONG && known.longs) {
+            const bool mine_is = beside && search.is_long(search.query_radii[id_of(mine.id)]);
+            is_long = __shfl_sync(ALL, mine_is, 0);
+            beside = beside && mine_is == is_long;
         }
         if constexpr (BATCHED) {
             system = beside ? system_of(search.queries + (long long)ROW * id_of(mine.id)) : 0;
@@ -136,7 +144,7 @@ struct Group {
     }
     // Returns the square, in units of the box, beyond which nothing is a neighbor by this one of cutoffs that differ.
     JFRNN_MEMBER real near_of(const PairSearch& search, real cutoff) const {
-        const real off = CROSSING ? 2 * search.lattice.slack() * scale : real(0);
+        const real off = PERIODIC ? 2 * search.lattice.slack() * scale : real(0);
         const real square = PairCutoffs::outside_of(cutoff * scale, off) * (1 + 16 * PairSearch::step_eps) * unit * unit;
         return square + (DOUBLE ? real(0) : real(1e-30));
     }
@@ -151,19 +159,19 @@ struct Group {
         const real radius = DIFFER && BY_OWN ? largest : search.radius,
                    between = search.SITED ? search.between : shared_known().between;
         const real group_radius = (SCALED ? radius * scale : radius) * unit;
-        const real outer = CROSSING ? (radius + 2 * search.lattice.slack()) * (SCALED ? scale : real(1)) * unit : group_radius;
+        const real outer = PERIODIC ? (radius + 2 * search.lattice.slack()) * (SCALED ? scale : real(1)) * unit : group_radius;
         real near_square = outer * outer * (1 + 8 * PairSearch::step_eps) + (DOUBLE ? real(0) : real(1e-30));
         if constexpr (DIFFER)
             near_square = near_of(search, largest);
         const float reach = fminf(diagonal * (float)unit + (float)outer, 240);
         float coarse_band = reach * reach * (RULE == TABLE ? 3e-5f : 2e-5f);
         const float site = (float)(shared_known().site * (SCALED ? scale : real(1)) * unit), square_unit = site * site;
-        const bool on_lattice = !DOUBLE && site > 0 && reach < 239 && coarse_band < 0.25f * square_unit;
+        const bool on_lattice = !DOUBLE && site > 0 && !is_long && reach < 239 && coarse_band < 0.25f * square_unit;
         if (on_lattice) {
             coarse_square = (float)between * square_unit;
             coarse_band = -1;
         } else {
-            if constexpr (CROSSING)
+            if constexpr (PERIODIC)
                 coarse_band += 1.001f * (float)((outer - group_radius) * (outer + group_radius));
             const float mine = (float)(DIFFER ? search.upper * scale * unit : group_radius) * (search.few_kinds() ? 0 : 1);
             coarse_square = mine * mine - coarse_band;

@@ -11,14 +11,14 @@ JFRNN_FUNCTION Place load(const Place* from) {
         return Place{{(real)a.x, (real)a.y, (real)a.z}, (real)a.w};
     }
 }
-// Loads a place by a predicate. Sums need no id, so it is not loaded: its register would be given to another value, which would wait
-// for the load.
+// Loads a place by a predicate. Sums need no id, if nothing is excluded, so it is not loaded: its register would be given to another
+// value, which would wait for the load.
 template <class AnyPlace>
 JFRNN_FUNCTION void load_if(bool is_loaded, const Place* from, AnyPlace& to) {
     if constexpr (sizeof(to.id) == 8) {
         if (is_loaded)
             to = load(from);
-    } else if constexpr (SUMS)
+    } else if constexpr (SUMS && !EXCLUDING)
         asm volatile(
             "{.reg .pred is; setp.ne.u32 is, %3, 0; @is ld.global.nc.f32 %0, [%4];"
             "@is ld.global.nc.f32 %1, [%4 + 4]; @is ld.global.nc.f32 %2, [%4 + 8];}"
@@ -34,7 +34,7 @@ JFRNN_FUNCTION void load_if(bool is_loaded, const Place* from, AnyPlace& to) {
 // stands at its place. The code of an image counts shifts along the axes, the last one fastest. An id holds it in the upper bits or,
 // where images are told apart in lists, as lists do.
 struct ImageSearch : Search {
-    // Inside, no row of cells leaves the box, and nothing that is near comes from outside of it: all are at home, nothing is moved.
+    // Inside, no row of cells leaves the box: all that is near is at home, nothing is moved.
     static constexpr bool INSIDE = !CROSSING;
     static constexpr int ID_BITS = 27;
     static constexpr int IDS = (PERIODIC == 1 || SUMS) && INSIDE ? 0 : PERIODIC;  // 0: ids tell no image, 1: in the upper bits
@@ -74,11 +74,11 @@ struct ImageSearch : Search {
             moved[k] = lattice.translation(shift[0], shift[1], shift[2], k);
     }
     JFRNN_MEMBER int source_named(int id) const { return SUMS ? id_of(__ldg(&sorted[source_of(id)].id)) : source_of(id); }
-    // How rows of what queries exclude name a candidate (excluded.h).
-    JFRNN_MEMBER int excluded_id(int id) const {
+    // How rows of what queries exclude name a candidate of a source (excluded.h).
+    JFRNN_MEMBER int excluded_id(int id, int source) const {
         if constexpr (EXCLUDING == 2)
-            return Excluded::id_of(source_named(id), IDS ? image_of(id) : (count_codes() - 1) / 2, n);
-        return source_named(id);
+            return Excluded::id_of(source, IDS ? image_of(id) : (count_codes() - 1) / 2, n);
+        return source;
     }
     // Loads where a candidate is. It is moved by the same operations wherever it is loaded, so that it is always in the same place.
     JFRNN_MEMBER void load_image(int id, real* p) const {

@@ -55,6 +55,8 @@ JFRNN_FUNCTION BlockBits meet_one_by_one(const PairSearch& search, const real* q
 JFRNN_FUNCTION BlockBits meet_by_cutoffs(const PairSearch& search, const real* q, unsigned int first_candidate) {
     const Warp& warp = shared_warp();
     unsigned int hits = 0, beyond = 0;
+    constexpr bool ONE_BAND = RULE == MEAN && !TREE;  // of all candidates: in cells, cutoffs are alike
+    const real mine = search.own_radius / 2 * search.step_scale, band = ONE_BAND ? search.mean_band() : real(0);
     constexpr int ALONG = 16 / sizeof(real);
 #pragma unroll
     for (int j = 32 - ALONG; j >= 0; j -= ALONG) {
@@ -75,15 +77,21 @@ JFRNN_FUNCTION BlockBits meet_by_cutoffs(const PairSearch& search, const real* q
                 const real d = (loaded[a].x[e] - q[a]) * search.step_scale;
                 square += d * d;
             }
-            const auto bounds = search.bounds_with(known);
-            hits = __funnelshift_l(upper_word(square - bounds.inside), hits, 1);
-            beyond = __funnelshift_l(upper_word(bounds.outside - square), beyond, 1);
+            if constexpr (ONE_BAND) {
+                const real mean = mine + known[0], over = square - mean * mean;
+                hits = __funnelshift_l(upper_word(over + band), hits, 1);
+                beyond = __funnelshift_l(upper_word(band - over), beyond, 1);
+            } else {
+                const auto bounds = search.bounds_with(known);
+                hits = __funnelshift_l(upper_word(square - bounds.inside), hits, 1);
+                beyond = __funnelshift_l(upper_word(bounds.outside - square), beyond, 1);
+            }
         }
     }
     return {hits, ~(hits | beyond)};
 }
 // Returns the candidates of a block that a query may meet at all: those that there are, not itself, and of half lists later ones.
-JFRNN_FUNCTION unsigned int find_met(const PairSearch& search, const Group& group, Pairs& pairs, unsigned int first_candidate) {
+JFRNN_FUNCTION unsigned int find_met(const PairSearch& search, const Group& group, Pairs& pairs, const int* ids) {
     const unsigned int here = pairs.kept - pairs.tested < 32 ? pairs.kept - pairs.tested : 32;
     unsigned int met = search.lane < group.size ? ALL >> (32 - here) : 0;
     if (pairs.meets_itself)
@@ -91,11 +99,14 @@ JFRNN_FUNCTION unsigned int find_met(const PairSearch& search, const Group& grou
     pairs.meets_itself = false;
     if constexpr (LATER) {
         unsigned int earlier = 0;
+        const int first = search.first_after(group.my_id);
 #pragma unroll
-        for (int j = 31; j >= 0; --j) {
-            const int candidate = shared_warp().candidate_ids[first_candidate + j];
-            const int later_by = search.order_of(candidate) - search.first_after(group.my_id);
-            earlier = __funnelshift_l((unsigned int)later_by, earlier, 1);
+        for (int j = 28; j >= 0; j -= 4) {
+            const int4 four = *(const int4*)(ids + j);
+            earlier = __funnelshift_l((unsigned int)(search.order_of(four.w) - first), earlier, 1);
+            earlier = __funnelshift_l((unsigned int)(search.order_of(four.z) - first), earlier, 1);
+            earlier = __funnelshift_l((unsigned int)(search.order_of(four.y) - first), earlier, 1);
+            earlier = __funnelshift_l((unsigned int)(search.order_of(four.x) - first), earlier, 1);
         }
         met &= ~earlier;
     }
@@ -104,13 +115,14 @@ JFRNN_FUNCTION unsigned int find_met(const PairSearch& search, const Group& grou
 // Returns which of the neighbors in a block of so many candidates a query does not exclude. Few candidates stand in the row of any query
 // of the group: the others are told apart by one lane each.
 JFRNN_FUNCTION unsigned int drop_excluded(
-    const PairSearch& search, const Group& group, const int* ids, int size, unsigned int hits) {
+    const PairSearch& search, const Group& group, const int* ids, const int* sources, int size, unsigned int hits) {
     const Warp& warp = shared_warp();
     const int lane = search.lane;
-    const bool by_any = lane < size && warp.excluded_by_any.may_have(search.excluded_id(ids[lane]));
+    auto named = [&](int j) { return search.excluded_id(ids[j], NAMED_APART ? sources[j] : search.source_named(ids[j])); };
+    const bool by_any = lane < size && warp.excluded_by_any.may_have(named(lane));
     const int* const kept = warp.excluded[lane];
     for (unsigned int rest = hits & __ballot_sync(ALL, by_any); rest; rest &= rest - 1) {
-        const int j = __ffs(rest) - 1, id = search.excluded_id(ids[j]);
+        const int j = __ffs(rest) - 1, id = named(j);
         bool found =
             kept[0] == Excluded::MANY && Excluded(search.excluded_starts, search.excluded, group.my_id, warp.filters[lane]).has(id);
 #pragma unroll
@@ -145,7 +157,8 @@ JFRNN_FUNCTION void meet_block(
     const PairSearch& search, const Group& group, Matrix& matrix, Candidates& candidates, Aside& aside, Pairs& pairs) {
     Warp& warp = shared_warp();
     const unsigned int first_candidate = pairs.tested % RING;
-    const unsigned int met = find_met(search, group, pairs, first_candidate);
+    const int* const ids = HELD ? warp.ids + pairs.tested : warp.candidate_ids + first_candidate;
+    const unsigned int met = find_met(search, group, pairs, ids);
     BlockBits block;
     if constexpr (VARY && !MATRIX)
         block = meet_by_cutoffs(search, group.mine.p, first_candidate);
@@ -168,8 +181,7 @@ JFRNN_FUNCTION void meet_block(
         aside.put(candidates, matrix);
         const bool has_it = !MATRIX || CROSSING;
         const Place query = has_it ? group.mine : open ? search.load_query(group.place + search.lane) : Place{{0, 0, 0}, 0};
-        const int* const ids = HELD ? warp.ids + pairs.tested : warp.candidate_ids + first_candidate;
-        if constexpr (TREE)
+        if constexpr (TREE || LONG)
             decide_together(search, group, query, ids, open, hits);
         for (; open; open &= open - 1) {
             const int j = __ffs(open) - 1;
@@ -178,8 +190,7 @@ JFRNN_FUNCTION void meet_block(
         aside.take_back(candidates, matrix);
     }
     if constexpr (EXCLUDING)
-        hits = drop_excluded(
-            search, group, HELD ? warp.ids + pairs.tested : warp.candidate_ids + first_candidate, pairs.kept - pairs.tested, hits);
+        hits = drop_excluded(search, group, ids, warp.candidate_ids + first_candidate, pairs.kept - pairs.tested, hits);
     pairs.found += __popc(hits);
     if constexpr (HELD) {
         warp.hits[pairs.tested / 32][search.lane] = hits;

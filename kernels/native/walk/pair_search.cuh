@@ -34,6 +34,7 @@ struct PairSearch : ImageSearch {
             known.between = known.site > 0 && !DIFFER ? (real)square_between(radius, known.site, closed) : real(0);
             known.grid = shared.grid;
             known.finite_queries = shared.finite_queries;
+            known.longs = LONG && has_long_queries() ? shared.longs : 0;
             known.longest_before = SUMS ? 0 : *(volatile int*)&info[0];
         }
         __syncwarp();
@@ -44,10 +45,10 @@ struct PairSearch : ImageSearch {
         sure_square = DOUBLE && known.between > 0 ? known.between * known.site * known.site
                                                   : inner_radius * inner_radius - 8 * (1 + SHIFTED) * step_eps * square_radius;
         const real beyond = outer_radius * outer_radius * (1 + 16 * step_eps) - sure_square;
-        band = DOUBLE && known.between > 0 ? real(-1) : CROSSING ? real(0.5) * beyond : 8 * step_eps * square_radius;
+        band = DOUBLE && known.between > 0 ? real(-1) : PERIODIC ? real(0.5) * beyond : 8 * step_eps * square_radius;
     }
-    // By which the distances of images may be off, beyond what rounding takes from a difference.
-    JFRNN_MEMBER real off() const { return CROSSING ? 2 * lattice.slack() * step_scale : real(0); }
+    // By which distances in a box may be off, beyond what rounding takes from a difference: of images, and of points brought into it.
+    JFRNN_MEMBER real off() const { return PERIODIC ? 2 * lattice.slack() * step_scale : real(0); }
     // Where cutoffs DIFFER: takes those of the query of this lane, if it has one.
     JFRNN_MEMBER void take_cutoffs(int id, bool has_query) {
         own_radius = RULE != SCATTER && has_query ? query_radii[id] : real(0);
@@ -56,13 +57,15 @@ struct PairSearch : ImageSearch {
         own_bounds = PairCutoffs::bounds_of(own_radius * step_scale, off());
         sure_square = own_bounds.inside;  // of GATHER
         band = (own_bounds.outside - own_bounds.inside) / 2;
-        const real site = SITED ? shared_known().site : real(0);
+        const real site = SITED && !is_long(own_radius) ? shared_known().site : real(0);
         between = site > 0 ? (real)square_between(own_radius, site, closed) : real(0);
         if (DOUBLE && site > 0) {
             sure_square = between * (site * step_scale) * (site * step_scale);
             band = -1;
         }
     }
+    // Is a cutoff longer than cells know?
+    JFRNN_MEMBER bool is_long(real cutoff) const { return LONG && cutoff > radius; }
     // Are species so few that tensor cores know the cutoffs of their pairs?
     JFRNN_MEMBER bool few_kinds() const { return RULE == TABLE && kinds <= MOST_KINDS; }
     // What is known of the cutoffs of a source.
@@ -70,7 +73,7 @@ struct PairSearch : ImageSearch {
         if constexpr (RULE == TABLE)
             known[0] = bits_as_real(kinds_of_sources[source]);
         else if constexpr (RULE == MEAN)
-            known[0] = radii[source];
+            known[0] = radii[source] / 2 * step_scale;
         else if constexpr (VARY) {
             const auto bounds = PairCutoffs::bounds_of(radii[source] * step_scale, off());
             known[0] = bounds.inside;
@@ -81,10 +84,15 @@ struct PairSearch : ImageSearch {
     JFRNN_MEMBER PairCutoffs::Bounds<real> bounds_with(const real* known) const {
         if constexpr (BANDED)
             return {PairCutoffs::of_pair(own_bounds.inside, known[0]), PairCutoffs::of_pair(own_bounds.outside, known[1])};
-        int other = RULE == TABLE ? id_of(known[0]) : 0;
-        other = (unsigned int)other < (unsigned int)kinds ? other : 0;  // behind the last candidate stands anything
-        const real r = RULE == TABLE ? of_kinds[other] : PairCutoffs::of_pair(own_radius, known[0]);
-        return PairCutoffs::bounds_of(r * step_scale, off());
+        if constexpr (SUM)
+            return PairCutoffs::bounds_of(own_radius / 2 * step_scale + known[0], off());
+        const int other = id_of(known[0]), kind = (unsigned int)other < (unsigned int)kinds ? other : 0;  // maybe of no candidate
+        return PairCutoffs::bounds_of(of_kinds[kind] * step_scale, off());
+    }
+    // Around the square of any mean that a query of cells may have: the band in which pairs are decided exactly, to either side.
+    JFRNN_MEMBER real mean_band() const {
+        const real most = larger(upper * step_scale, LEAST), off = this->off();
+        return PairCutoffs::CUTOFFS * step_eps * most * most + (2 * most + off) * off;
     }
     // |b - a|^2 - r^2 + band in working precision, fused or not: off by less than 5 eps r^2 where it is near [0, 2 band], see
     // jfrnn/_geometry/exact.py. Negative: surely closer than the cutoff. Its upper word has the sign and, if not negative, the order
@@ -107,16 +115,7 @@ struct PairSearch : ImageSearch {
         if constexpr (DIFFER)
             return is_neighbor_by_cutoffs(q, p, my_id, id, own_radius);
         const real over = excess(q, p);
-        bool hit = over < 0;
-        if (over >= 0 && over <= 2 * band) {
-            if constexpr (INSIDE)
-                hit = exact_pair(q, p, radius, 0, closed);
-            else {
-                const real* source = positions + (long long)ROW * source_named(id);
-                hit = exact_image(lattice, queries + (long long)ROW * my_id, source, image_of(id), radius, 0, closed);
-            }
-        }
-        return hit;
+        return over < 0 || (over <= 2 * band && is_pair(q, p, my_id, id, radius, 0));
     }
     // The cutoffs of the species of a query with each other.
     JFRNN_MEMBER const real* row_of_kind(int query) const { return table_of_kinds + (long long)kinds * kinds_of_queries[query]; }
@@ -135,9 +134,13 @@ struct PairSearch : ImageSearch {
         if (square < bounds.inside || !(square <= bounds.outside))
             return square < bounds.inside;
         const real first = SUM ? own / 2 : r, more = SUM ? other / 2 : real(0);
-        if constexpr (INSIDE)
+        return is_pair(q, p, my_id, id, first, more);
+    }
+    // Decides a pair exactly: of a box, by what was given, since points that were brought into it are rounded.
+    JFRNN_MEMBER bool is_pair(const real* q, const real* p, int my_id, int id, real first, real more) const {
+        if constexpr (!PERIODIC)
             return exact_pair(q, p, first, more, closed);
-        const real* there = positions + (long long)ROW * source;
-        return exact_image(lattice, queries + (long long)ROW * my_id, there, image_of(id), first, more, closed);
+        const real *here = queries + (long long)ROW * my_id, *there = positions + (long long)ROW * source_named(id);
+        return exact_image(lattice, here, there, INSIDE ? (count_codes() - 1) / 2 : image_of(id), first, more, closed);
     }
 };

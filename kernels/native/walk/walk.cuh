@@ -31,27 +31,34 @@ struct Walk : PairSearch {
         else
             serve(block);
     }
-    // Serves the queries of a block. Those with the largest cutoffs of all, which come first in a tree, may lie far from each other and
-    // have many candidates each: no block serves two of them.
+    // Serves the queries of a block. Those with the largest cutoffs of all may lie far from each other and have many candidates each: no
+    // block serves two of them. In a tree they come first; of cells it is those that these are not made for.
     JFRNN_MEMBER void serve(int block) {
         constexpr int MOST_APART = TREE ? 32 : 0;
-        const int share = 1 << share_bits, apart = query_blocks < MOST_APART ? query_blocks : MOST_APART;
+        const int share = 1 << share_bits, first_ones = query_blocks < MOST_APART ? query_blocks : MOST_APART;
+        const int apart = LONG ? shared_known().longs : first_ones;
         const long long begin = (long long)block << share_bits, end = begin + share;
         served = block;
         query().open(block);
 #pragma unroll 1
         for (bool alone = block < apart;; alone = false) {
-            const int place = alone ? block : begin < apart ? apart : begin < m ? (int)begin : m;
-            serve_queries(place, alone ? block + 1 : end < m ? (int)end : m);
+            const int rest = begin < first_ones ? first_ones : begin < m ? (int)begin : m;
+            const int place = !alone ? rest : LONG ? shared.long_places[block] : block;
+            if (place >= 0)
+                serve_queries(place, alone ? place + 1 : end < m ? (int)end : m, alone);
             if (!alone)
                 break;
         }
     }
     // Serves the queries from a place on, group by group.
-    JFRNN_MEMBER void serve_queries(int place, int stop) {
+    JFRNN_MEMBER void serve_queries(int place, int stop, bool alone) {
         bool loose = false;  // of a tree: whether some have been far from each other
         while (place < stop) {
             Group group(*this, place, stop);
+            if (group.is_long && !alone) {
+                place += group.size;
+                continue;
+            }
             if (group.size == 0) {
                 if (TREE && lane == 0)
                     atomicOr(&info[1], 2);
@@ -134,7 +141,7 @@ struct Walk : PairSearch {
             Place at_home = group.mine;
             if constexpr (PERIODIC == 2 || SUMS)
                 at_home.id = bits_as_real(id_of_image(SUMS ? group.place + lane : group.my_id, home));
-            keep(*this, lane < group.size, at_home, x, lane);
+            keep(*this, lane < group.size, at_home, group.my_id, x, lane);
             pairs.kept = group.size;
         }
     }

@@ -12,17 +12,17 @@ from typer.testing import CliRunner
 from experiments import _commands, _config
 from experiments._cli import app
 from experiments._errors import UsageError
-from experiments.gpu.config import Config
+from experiments.bench.gpu import Config
 
 ROOT = Path(_commands.__file__).resolve().parent.parent
 CONFIGS = ROOT / "experiments" / "configs"
-TOP = ("run", "init", "report", "tables", "merge", "list", "show", "export", "gpu", "bench", "sph")
+TOP = ("run", "init", "report", "tables", "merge", "list", "show", "export", "bench", "sph", "gpu")
 BENCH = (
-    *("crystals", "distributed", "arrays", "latency", "lj", "options", "peers", "skin", "start", "guides"),
+    *("crystals", "distributed", "arrays", "latency", "lj", "options", "peers", "start", "guides"),
     *("structures", "sums", "ties", "triangles"),
 )
-SPH = ("validate", "speed", "gradients", "peers", "thin", "start")
-COMMANDS = (*TOP[:9], *(f"bench {name}" for name in BENCH), *(f"sph {name}" for name in SPH))
+SPH = ("validate", "speed", "gradients", "peers")
+COMMANDS = (*TOP[:8], "gpu", *(f"bench {name}" for name in BENCH), *(f"sph {name}" for name in SPH))
 
 
 def refused(*arguments):
@@ -57,7 +57,7 @@ def test_the_list_of_commands_fits_a_screen(group, names):
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_help_keeps_what_stands_in_brackets(command):
-    units = {"show": ["[m]"], "export": ["[m]"], "run": ["[s]"], "bench skin": ["[m]"]}
+    units = {"show": ["[m]"], "export": ["[m]"], "run": ["[s]"]}
     units |= {"bench triangles": ["[modules]"], "bench peers": ["[s]", "--group peers"]}
     units |= {"bench latency": ["[µs]"], "bench start": ["[s]"], "bench structures": ["angstrom"]}
     text = told(*command.split(), "--help")
@@ -77,10 +77,10 @@ def test_list_says_what_there_is():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("bench", "skin", "--steps", "0"), "--steps 0: "),
-        (("bench", "skin", "--repeats=1"), "--repeats 1: "),
-        (("bench", "skin", "--spacing", "nan"), "--spacing nan: "),
-        (("bench", "skin", "--spacing", "-1"), "--spacing -1: "),
+        (("bench", "lj", "--steps", "0"), "--steps 0: "),
+        (("bench", "arrays", "--repeats=1"), "--repeats 1: "),
+        (("show", "corners", "--spacing", "nan"), "--spacing nan: "),
+        (("show", "corners", "--spacing", "-1"), "--spacing -1: "),
         (("bench", "triangles", "--points", "10000000000"), "--points 10000000000: "),
         (("bench", "triangles", "--points", "abc"), "--points abc: "),
         (("bench", "triangles", "--rounds", "1"), "--rounds 1: "),
@@ -136,15 +136,13 @@ def test_configs_that_are_none(tmp_path, command):
 
 def test_a_key_in_a_table_of_a_config_is_told_what_its_table_allows(tmp_path):
     path = tmp_path / "gpu.toml"
-    path.write_text(
-        (CONFIGS / "h200.toml").read_text()
-        + "\n[[triangles]]\npoints = [1]\nfaces = 500\ncutoffs = [nan]\ndtypes = []\nspeed = 1\n"
-    )
+    path.write_text('[[exactness]]\nbackend = "warp"\ndtypes = ["float16"]\ndims = []\ncapacity = 0\nspeed = 1\n')
     with pytest.raises(UsageError) as caught:
         _config.load(path, Config)
     lines = str(caught.value).splitlines()
-    assert f"{path}: triangles[0].speed: unknown key (value 1); allowed: points, faces, cutoffs, dtypes" in lines
-    assert f"{path}: triangles[0].cutoffs[0]: got nan; input should be a finite number" in lines
+    allowed = "backend, dtypes, dims, capacity, cases, least_rows"
+    assert f"{path}: exactness[0].speed: unknown key (value 1); allowed: {allowed}" in lines
+    assert f"{path}: exactness[0].dtypes[0]: got 'float16'; input should be 'float32' or 'float64'" in lines
 
 
 @pytest.mark.parametrize(
@@ -180,9 +178,7 @@ def test_steps_are_timed_of_scenes_that_have_an_nx(tmp_path):
         ("sph", "validate", "one"),
         ("sph", "gradients", "memory"),
         ("sph", "peers"),
-        ("sph", "start"),
-        ("sph", "thin"),
-        *(("bench", name) for name in ("options", "ties", "triangles", "skin", "latency", "start")),
+        *(("bench", name) for name in ("options", "ties", "triangles", "latency", "start")),
         ("bench", "peers", "scipy"),
     ],
     ids=lambda arguments: " ".join(map(str, arguments[:2])),

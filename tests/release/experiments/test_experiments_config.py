@@ -7,9 +7,10 @@ import pytest
 from places import ROOT
 from typer.testing import CliRunner
 
-from experiments import _config, _keys, _layouts, _rows, _sweep, _thesis, _worker, methods
+from experiments import _config, _layouts, _rows, _sweep, _thesis, _worker, methods
 from experiments._cli import app
 from experiments._errors import UsageError
+from experiments.pages import configs
 
 CONFIGS = ROOT / "experiments" / "configs"
 
@@ -54,7 +55,7 @@ def test_a_config_is_narrowed_and_what_is_asked_for_is_checked(tmp_path):
 
 
 def test_the_config_to_begin_with_says_every_key(tmp_path):
-    config, text = load(tmp_path, _keys.example()), _keys.example()
+    config, text = load(tmp_path, configs.example()), configs.example()
     commented = "\n".join(line.removeprefix("# ") if " = " in line else line for line in text.splitlines())
     said = {name for kind in (_config.Config, _config.Scenes) for name in kind.model_fields} - {"scenes"}
     assert {line.split(" = ")[0] for line in commented.splitlines() if " = " in line} == said

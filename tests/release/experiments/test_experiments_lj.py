@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 import jfrnn
 from experiments import methods
 from experiments._cli import app
-from experiments.bench import lj, lj_liquid, lj_peers
+from experiments.bench import lj, lj_peers
 from experiments.pages import liquid as tables
 
 
@@ -21,19 +21,19 @@ def plain(square):
 
 def with_other_fade(square):
     """The end of OpenMM's potential and of LAMMPS's lj/mdf."""
-    place = jnp.clip((jnp.sqrt(square) - lj_liquid.ONSET) / (lj_liquid.CUTOFF - lj_liquid.ONSET), 0, 1)
+    place = jnp.clip((jnp.sqrt(square) - lj_peers.ONSET) / (lj_peers.CUTOFF - lj_peers.ONSET), 0, 1)
     return plain(square) * (1 - place) ** 3 * (1 + 3 * place + 6 * place**2)
 
 
 POTENTIALS = {
-    **{"jax-md dense": lj_liquid.energy_of, "jax-md ordered sparse": lj_liquid.energy_of, "OpenMM": with_other_fade},
-    **{"LAMMPS lj/mdf": with_other_fade, "LAMMPS lj/cut": lambda square: plain(square) - plain(lj_liquid.CUTOFF**2)},
+    **{"jax-md dense": lj_peers.energy_of, "jax-md ordered sparse": lj_peers.energy_of, "OpenMM": with_other_fade},
+    **{"LAMMPS lj/mdf": with_other_fade, "LAMMPS lj/cut": lambda square: plain(square) - plain(lj_peers.CUTOFF**2)},
 }
 
 
 @pytest.fixture
 def liquid(foreign):
-    return lj_liquid.make_crystal(512)
+    return lj_peers.make_crystal(512)
 
 
 def test_ways_have_one_energy_and_one_path(liquid):
@@ -55,7 +55,7 @@ def test_peers_have_the_energies_that_their_potentials_give(name, liquid):
         pytest.skip(missing)
 
     def by_search(x, box):
-        return jfrnn.pair_sum(lambda r, i, j: POTENTIALS[name](r @ r) / 2, x, lj_liquid.CUTOFF, box=box)
+        return jfrnn.pair_sum(lambda r, i, j: POTENTIALS[name](r @ r) / 2, x, lj_peers.CUTOFF, box=box)
 
     theirs = peer.run(lj_peers.Asked(liquid, 0.3, 20, 1))
     wide = liquid._replace(x=liquid.x.astype(jnp.float64), v=liquid.v.astype(jnp.float64))
@@ -66,10 +66,10 @@ def test_peers_have_the_energies_that_their_potentials_give(name, liquid):
 
 def test_the_potential_goes_to_zero_smoothly():
     r = np.linspace(0.9, 2.5, 200)
-    inside = r[r < lj_liquid.ONSET]
-    np.testing.assert_allclose(lj_liquid.energy_of(jnp.asarray(inside**2)), 4 * (inside**-12 - inside**-6), rtol=1e-12)
-    assert abs(float(lj_liquid.energy_of(jnp.asarray(6.25)))) < 1e-12
-    steps = np.diff(np.asarray(lj_liquid.energy_of(jnp.asarray(r[r > 1.9] ** 2))))
+    inside = r[r < lj_peers.ONSET]
+    np.testing.assert_allclose(lj_peers.energy_of(jnp.asarray(inside**2)), 4 * (inside**-12 - inside**-6), rtol=1e-12)
+    assert abs(float(lj_peers.energy_of(jnp.asarray(6.25)))) < 1e-12
+    steps = np.diff(np.asarray(lj_peers.energy_of(jnp.asarray(r[r > 1.9] ** 2))))
     assert np.abs(np.diff(steps)).max() < 5e-4
 
 

@@ -9,7 +9,7 @@ import pytest
 from matplotlib.image import imread
 from typer.testing import CliRunner
 
-from experiments import _look, _plots, _report, _reports, _table, _thesis
+from experiments import _look, _plots, _report, _table, _thesis
 from experiments._cli import app
 from experiments._rows import RowFile, SearchRow, values_of
 
@@ -314,12 +314,12 @@ def test_rows_of_earlier_runs_are_read_with_their_columns(tmp_path, path):
     """Every study reads the rows that are kept of it: what a row says is what is read."""
     packed = path.suffix == ".gz"
     (tmp_path / f"rows.jsonl{'.gz' * packed}").write_bytes(path.read_bytes())
-    kind, _ = _reports.kind_of(tmp_path)
+    kind, _ = _report.kind_of(tmp_path)
     rows = RowFile(tmp_path, kind).read_all()
     text = gzip.decompress(path.read_bytes()).decode() if packed else path.read_text()
     first, read = json.loads(text.splitlines()[0]), values_of(rows[0])
     assert {name: read[name] for name in first} == first
-    assert (kind is dict) == ("way" not in first and ("kind" in first or "scaling" in first))
+    assert (kind is dict) == ("fill_asked" not in first)
 
 
 def test_rows_that_are_packed_come_before_those_that_were_added(tmp_path):

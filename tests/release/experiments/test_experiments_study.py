@@ -1,15 +1,13 @@
 """Effects of one factor with their uncertainty, small versions of sweeps, and the thesis's table beside ours."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from test_experiments_report import SCENES, make_row, make_rows
 
-from experiments import _config, _figures, _study, _thesis, _worker
-
-CONFIGS = Path(_config.__file__).parent / "configs"
+from experiments import _figures, _study, _thesis
+from experiments._errors import UsageError
 
 
 def turned_rows(factor, noise, seed=0):
@@ -65,13 +63,9 @@ def test_effects_name_every_value_and_adjust_for_their_number():
     assert _study.effect(_study.rounds(one), "angle", 0.0, 46.0) is None
 
 
-@pytest.mark.parametrize("path", sorted([*CONFIGS.glob("sweep_*.toml"), CONFIGS / "thesis.toml"]), ids=lambda path: path.stem)
-def test_every_sweep_has_a_small_version(path):
-    small = _study.shrink(_config.load(path))
-    specs = list(small.specs())
-    assert len(specs) <= 24
-    for spec in {spec.scene_key: spec for spec in specs}.values():
-        assert len(_worker.make_scene(spec).positions) <= 20_000
+def test_a_sweep_without_rows_says_what_makes_them():
+    with pytest.raises(UsageError, match="none: no rows; fill it with `python -m experiments run"):
+        _study.rows("none")
 
 
 def test_table_6_1_stands_beside_ours():

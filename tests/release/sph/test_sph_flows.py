@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import jfrnn
-from experiments.sph import vortices
+from experiments.sph import answers
 from jfrnn.cases import fluids
 from jfrnn.cases._fluid_flows import taylor_green_velocity
 from jfrnn.sph import budget, forces, health, relax, solver
@@ -75,7 +75,7 @@ def test_taylor_green_vortices_at_24_particles(transport, l1, most):
 def test_taylor_green_in_3d_loses_the_energy_that_it_has_to():
     scene = fluids.fluid("taylor-green", nx=8, dim=3, duration=0.65 / (2 * np.pi))
     model, s = run(scene)
-    (energy,), (rate,) = vortices.energies(np.array([0.65]), 100 / (2 * np.pi), n=12)
+    (energy,), (rate,) = answers.vortices(np.array([0.65]), 100 / (2 * np.pi), n=12)
     energy -= rate * (2 * np.pi * float(s.time) - 0.65)
     assert budget.kinetic_energy(model, s) == pytest.approx(energy, rel=0.02)  # 22 % are lost
 

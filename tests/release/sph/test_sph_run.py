@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import threading
 import time
@@ -16,7 +17,6 @@ from test_sph_commands import read_table
 from jfrnn._triangles.winding import is_closed
 from jfrnn.cases import fluids, meshes
 from jfrnn.sph import health, runs
-from jfrnn.sph.errors import SceneError
 from jfrnn.sph.files import read_solid, with_solid
 from jfrnn.sph.model import make_model, make_state
 from jfrnn.sph.settings import make_scene
@@ -192,14 +192,15 @@ def test_walls_that_cannot_be_meant_are_refused(tmp_path, scene, center, edge, u
     assert not (tmp_path / "run").exists()
 
 
-@pytest.mark.parametrize("ending", ["stl", "obj", "ply"])
+@pytest.mark.parametrize("ending", ["stl", "obj", "ply", "txt"])
 def test_files_that_hold_no_wall_are_refused(tmp_path, ending):
     code, _, error = invoke("jet", "--solid", tmp_path / f"none.{ending}")
     assert (code, f"solid {tmp_path}/none.{ending} is no file: name an STL, OBJ or PLY." in error) == (2, True)
     for text in (b"", b"solid\n facet", b"\x00\xff" * 50, b"ply\nformat ascii 1.0\n", b"f 1 2 3\nv 0 0"):
         (tmp_path / f"broken.{ending}").write_bytes(text)
         code, _, error = invoke("jet", "--solid", tmp_path / f"broken.{ending}")
-        assert (code, error.startswith(f"error: solid {tmp_path}/broken.{ending} "), error.count("\n")) == (2, True, 1)
+        said = rf"error: solid {tmp_path}/broken\.{ending} (is no mesh that trimesh reads|holds no triangles).*\n"
+        assert (code, re.fullmatch(said, error) is not None) == (2, True), error
 
 
 def test_a_wall_that_is_open_is_refused_before_a_folder_is_made(tmp_path):
@@ -234,11 +235,3 @@ def test_meshes_are_read(tmp_path, kind):
     assert np.allclose(
         np.sort(points[named].reshape(len(faces), -1), axis=0), np.sort(vertices[faces].reshape(len(faces), -1), axis=0), atol=1e-6
     )
-
-
-def test_what_is_no_mesh_is_refused(tmp_path):
-    with pytest.raises(SceneError, match="is no file"):
-        read_solid(tmp_path / "none.stl")
-    (tmp_path / "text.txt").write_text("no mesh")
-    with pytest.raises(SceneError, match=r"is no mesh|holds no triangles"):
-        read_solid(tmp_path / "text.txt")

@@ -1,16 +1,37 @@
-"""A fresh process up to its first results, for `bench start`: `python -P first_result.py search|gradient` prints a line of JSON.
+"""A fresh process for `bench start` and `bench guides`: `python -P fresh.py search|gradient|PAGE.md` prints a line of JSON.
 
 Nothing but the standard library is imported before the clock runs. It asks of the library what every version of it can do.
 """
 
 import json
 import math
+import re
 import sys
+from pathlib import Path
 from time import perf_counter
 from typing import Any
 
 N = 1000
 NEIGHBORS = 30
+
+
+def read_page(page: str) -> None:
+    """Print how long a page's Python blocks take one after the other, and what is compiled for them."""
+    blocks = re.findall(r"^```python\n(.*?)^```", Path(page).read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE)
+    import jax
+
+    device = jax.block_until_ready(jax.numpy.zeros(1)).device
+    compiled: list[float] = []
+
+    def listen(event: str, duration_secs: float, **_: object) -> None:
+        if event.endswith("backend_compile_duration"):
+            compiled.append(duration_secs)
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    begin = perf_counter()
+    exec(compile("\n".join(blocks), page, "exec"), {"__name__": "page"})  # what a reader pastes
+    told = {"page_s": perf_counter() - begin, "programs": len(compiled), "compile_s": sum(compiled)}
+    print(json.dumps({**told, "platform": device.platform, "device": device.device_kind}))
 
 
 def main(what: str) -> None:
@@ -59,4 +80,4 @@ def _gradient(jax: Any, jfrnn: Any, x: Any, cutoff: float) -> float:  # noqa: AN
 
 
 if __name__ == "__main__":
-    main(sys.argv[1])
+    (read_page if sys.argv[1].endswith(".md") else main)(sys.argv[1])
