@@ -10,10 +10,9 @@ import numpy as np
 import pytest
 import reference
 from by_numpy import add_up, in_order
-from marked import assert_compensated, assert_marks, cancelling, marks
+from marked import assert_compensated, cancelling
 from test_pair_sum import (
     CUTOFF,
-    HARD,
     LENGTH,
     SLOW,
     N,
@@ -21,10 +20,7 @@ from test_pair_sum import (
     everything,
     oracle,
     oracle_sum,
-    partly_active,
     scene,
-    smooth,
-    smooth_slopes,
     stepped,
     tangents_of,
 )
@@ -71,46 +67,6 @@ def test_integers_travel_whose_bits_are_no_usual_floats(box):
     expected = [np.bincount(i[kinds[j] == k], minlength=300) for k in bits]
     assert all(total.sum() > 1000 for total in expected)
     np.testing.assert_array_equal(np.stack(found), np.stack(expected))
-
-
-def marked(x, cutoff, queries=None, **options):
-    ids = np.arange(LENGTH, dtype=x.dtype)
-    if queries is not None:
-        options |= {"queries": checked.padded(queries, LENGTH), "query_values": ids}
-    return fused(marks, jnp.asarray(checked.padded(x, LENGTH)), cutoff, ids, **options)
-
-
-@pytest.mark.parametrize(
-    ("dtype", "dim"),
-    [(np.float32, 3), (np.float64, 2), *(pytest.param(*kind, marks=SLOW) for kind in ((np.float32, 2), (np.float64, 3)))],
-)
-def test_hard_cases(dtype, dim):
-    for name in HARD:
-        given = HARD_CASES[name].build(dtype, dim)
-        pairs = reference.reference_pairs(given.positions, given.cutoff)
-        assert_marks(marked(given.positions, given.cutoff), pairs, given.positions)
-
-
-def test_options():
-    """Queries, with particles that are not active; then closed with include_self; each where it decides something."""
-    given = HARD_CASES["queries_coincident"].build(np.float32, 3)
-    active = np.arange(LENGTH) % 3 > 0
-    pairs = reference.reference_pairs(given.positions, given.cutoff, queries=given.queries)
-    found = marked(given.positions, given.cutoff, given.queries, active=active)
-    assert_marks(found, {(i, j) for i, j in pairs if active[j]}, given.positions, given.queries)
-    given = HARD_CASES["integers_9"].build(np.float32, 3)
-    pairs = reference.reference_pairs(given.positions, given.cutoff, closed=True, include_self=True)
-    assert len(pairs) > len(reference.reference_pairs(given.positions, given.cutoff))
-    assert_marks(marked(given.positions, given.cutoff, closed=True, include_self=True), pairs, given.positions)
-
-
-@pytest.mark.parametrize(("n", "m"), [(0, None), (0, 3), (3, 0), (1, None)])
-def test_empty(n, m):
-    x, ids = np.zeros((n, 3), np.float32), np.arange(n, dtype=np.float32)
-    options = {} if m is None else {"queries": np.zeros((m, 3), np.float32), "query_values": np.arange(m, dtype=np.float32)}
-    sums = fused(marks, x, 1.0, ids, **options)
-    assert sums["r"].shape == (n if m is None else m, 3)
-    assert not any(np.asarray(leaf).any() for leaf in jax.tree.leaves(sums))
 
 
 def test_more_candidates_than_fit():
@@ -223,30 +179,18 @@ def test_rounding_of_a_density():
 # --- derivatives -------------------------------------------------------------------------------------------------------------
 
 
-def test_derivatives():
-    """Of coincident points, at ties, in empty rows; then of random points: gradient and Hessian-vector product."""
-    found = everything(lambda x, m, s: fused(functools.partial(smooth, s), x, CUTOFF, {"m": m}))
-    for seed in (0, 1):
-        args, pairs = (*scene(seed), jnp.asarray(1.3)), reference.reference_pairs(scene(seed)[0], CUTOFF)
-        along = tangents_of(args)
-        assert_same(found(args, along), oracle(smooth_slopes, pairs, dict(zip(("x", "m", "scale"), args)), along))
+@pytest.mark.parametrize("apart", [True, False])
+def test_derivatives_with_queries(apart):
+    """Where they are the particles, positions of i and of j are one array, their values and derivatives are not."""
+    (x, m), q = scene(1), jnp.asarray(np.asarray(scene(2)[0])[:23])
+    args = (x, m, jnp.asarray(np.linspace(0.3, 0.6, 23 if apart else N)), *([q] if apart else []))
+    pairs, fn = reference.reference_pairs(x, CUTOFF, queries=q if apart else x), functools.partial(cheap, 0.7)
 
+    def sums(x, m, w, *q):
+        return fused(fn, x, CUTOFF, m, queries=q[0] if apart else x, query_values=w)
 
-def test_derivatives_with_queries():
-    (x, m), q, w = scene(1), jnp.asarray(np.asarray(scene(2)[0])[:23]), jnp.asarray(np.linspace(0.3, 0.6, 23))
-    fn, args = functools.partial(cheap, 0.7), (x, q, m, w)
-    pairs = reference.reference_pairs(x, CUTOFF, queries=q)
-    along = tangents_of(args)
-    found = everything(lambda x, q, m, w: fused(fn, x, CUTOFF, m, queries=q, query_values=w), False)
-    assert_same(found(args, along), oracle(stepped(cheap_terms), pairs, dict(zip("xqmw", args)), scale=0.7))
-
-
-def test_queries_at_the_particles_have_values_of_their_own():
-    """Positions of i and of j are one array then, their values and derivatives are not."""
-    (x, m), w = scene(1), jnp.asarray(np.linspace(0.3, 0.6, N))
-    pairs, fn, args = reference.reference_pairs(x, CUTOFF, queries=x), functools.partial(cheap, 0.7), (x, m, w)
-    found = everything(lambda x, m, w: fused(fn, x, CUTOFF, m, queries=x, query_values=w), False)
-    assert_same(found(args, tangents_of(args)), oracle(stepped(cheap_terms), pairs, dict(zip("xmw", args)), scale=0.7))
+    expected = oracle(stepped(cheap_terms), pairs, dict(zip("xmwq", args)), scale=0.7)
+    assert_same(everything(sums, False)(args, tangents_of(args)), expected)
 
 
 def cheap(scale, r, i, j):
@@ -258,34 +202,6 @@ def cheap_terms(scale, r, i, j):
     """Return what `cheap` is, by NumPy, in columns."""
     s, i, j = (r * r).sum(1)[:, None], i[:, None], j[:, None]
     return np.hstack([scale * j * s * i, (scale + s) * r * j])
-
-
-def test_in_a_batch():
-    """Systems that lie in the same place."""
-    x, m = scene(1)
-    batch = np.arange(N) % 3
-    pairs = {(i, j) for i, j in reference.reference_pairs(x, CUTOFF) if batch[i] == batch[j]}
-    found = fused(functools.partial(cheap, 1.0), x, CUTOFF, m, batch=batch)
-    expected = oracle_sum(functools.partial(cheap_terms, 1.0), pairs, x, x, m, m)
-    assert_same(found, {"a": expected[:, 0], "b": expected[:, 1:]})
-
-
-def test_what_is_no_pair_poisons_nothing():
-    """fn is NaN or infinite where there is no pair, and so are values and positions of inactive particles."""
-    x, m, active = partly_active()
-
-    def fn(r, i, j):
-        return i * j / jnp.sqrt(r @ r) * jnp.sqrt(CUTOFF - jnp.sqrt(r @ r))
-
-    def terms(_, r, i, j):
-        distance = np.sqrt((r * r).sum(1))
-        return (i * j / distance * np.sqrt(CUTOFF - distance))[:, None]
-
-    pairs = {(i, j) for i, j in reference.reference_pairs(x, CUTOFF) if active[i] and active[j]}
-    args, along = (x, m), tangents_of((x, m))
-    found = everything(lambda x, m: fused(fn, x, CUTOFF, m, active=active), False)(args, along)
-    assert_same(found, oracle(stepped(terms), pairs, {"x": x, "m": m}), 1e-9)
-    assert not np.asarray(found[1][0])[~active].any()
 
 
 def test_same_bits_in_a_scan_and_again():
@@ -308,18 +224,6 @@ def test_same_bits_in_a_scan_and_again():
 
 
 # --- memory, choice of the engine, errors ------------------------------------------------------------------------------------
-
-
-def test_memory_follows_the_particles():
-    """A million particles: gradient included, some words for each, though they had hundreds of neighbors."""
-    n = 1_000_000
-
-    def loss(x, m):
-        return (fused(lambda r, i, j: j * (1 - r @ r), x, 0.1, m) ** 2).sum()
-
-    shapes = jax.ShapeDtypeStruct((n, 3), np.float32), jax.ShapeDtypeStruct((n,), np.float32)
-    memory = jax.jit(jax.grad(loss, (0, 1))).lower(*shapes).compile().memory_analysis()
-    assert memory.temp_size_in_bytes < 1e6 + 250 * n
 
 
 def sorted_norm(r, i, j):

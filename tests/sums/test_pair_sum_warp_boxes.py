@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import reference
 from marked import assert_marks, marks
-from test_pair_sum import CUTOFF, SLOW, N, assert_same, everything, moved, oracle, scene, smooth, smooth_slopes, tangents_of
+from test_pair_sum import CUTOFF, SLOW, assert_same, everything, oracle, scene, smooth, smooth_slopes, tangents_of
 
 import jfrnn
 from jfrnn.cases.batches import BATCH_CASES
@@ -106,48 +106,20 @@ def test_batches(name):
 
 # --- derivatives -------------------------------------------------------------------------------------------------------------
 
-MATRIX = np.array([[0.9, 0.2, 0.0], [-0.2, 1.1, 0.1], [0.0, 0.0, 9.0]])
-PERIODIC = (True, True, False)
 
-
-@pytest.mark.parametrize("second", [False, pytest.param(True, marks=SLOW)])
-def test_derivatives(second):
-    """Several images of a pair, turns of particles; of the lattice vectors, by the oracle's sum and by finite differences."""
-    (x, m), fn = scene(1, dim=3), functools.partial(smooth, 0.7)
-    x = jnp.asarray(np.asarray(x) + (np.arange(N) % 5 - 2)[:, None] * MATRIX[0] - (np.arange(N) % 3)[:, None] * MATRIX[1])
-    pairs = reference.reference_images(x, CUTOFF, matrix=MATRIX, periodic=PERIODIC)
-
-    def sums(x, m, matrix):
-        return fused(fn, x, CUTOFF, {"m": m}, box=jfrnn.Box(matrix, PERIODIC, images=1))
-
-    args = (x, m, jnp.asarray(MATRIX))
-    along = (*tangents_of(args[:2]), jnp.asarray(MATRIX**2))
-    found = everything(sums, second)
-    value, gradient, product = found(args, along)
-    expected = oracle(smooth_slopes, pairs, dict(zip(("x", "m", "matrix"), args)), along if second else None, scale=0.7)
-    assert_same((value, gradient, product), expected)
-    step = 1e-7
-    ahead, behind = (found(moved(args, along, s), along) for s in (step, -step))
-    slope = sum(np.vdot(g, t) for g, t in zip(gradient, along, strict=True))
-    assert float(ahead[0] - behind[0]) / (2 * step) == pytest.approx(slope, rel=1e-5)
-
-
-@pytest.mark.slow
+@SLOW
 def test_derivatives_with_queries():
-    """Against the engine "jax"; the reversed pairs have their own turns."""
-    (x, m), q = scene(1), scene(2)[0][:23] - 3.0
-    w = jnp.linspace(0.3, 0.6, 23)
+    """The reversed pairs have their own turns."""
+    (x, m), q = scene(1), jnp.asarray(np.asarray(scene(2)[0])[:23] - np.array([3.0, 0.0]))
+    args = (x, q, m, jnp.linspace(0.3, 0.6, 23), jnp.array([1.3, 1.0]))
 
-    def sums(backend):
-        def of(x, q, m, w, lengths):
-            given = {"queries": q, "query_values": {"m": w}, "box": jfrnn.Box(lengths, (True, False)), "backend": backend}
-            return jfrnn.pair_sum(functools.partial(smooth, 0.7), x, CUTOFF, {"m": m}, **given)
+    def sums(x, q, m, w, lengths):
+        given = {"queries": q, "query_values": {"m": w}, "box": jfrnn.Box(lengths, (True, False))}
+        return fused(functools.partial(smooth, 0.7), x, CUTOFF, {"m": m}, **given)
 
-        return of
-
-    args = (x, q, m, w, jnp.array([1.3, 1.0]))
-    along = tangents_of(args)
-    assert_same(everything(sums("warp"))(args, along), everything(sums("jax"))(args, along))
+    along, pairs = tangents_of(args), reference.reference_images(x, CUTOFF, matrix=args[-1], periodic=(True, False), queries=q)
+    expected = oracle(smooth_slopes, pairs, dict(zip(("x", "q", "m", "w", "lengths"), args)), along, scale=0.7)
+    assert_same(everything(sums)(args, along), expected)
 
 
 # --- where there is no answer ----------------------------------------------------------------------------------
