@@ -289,33 +289,6 @@ def test_grow_in_boxes_that_shrink():
     assert listed_images(nbrs.grow(x, box=small), x) == oracle(boxes, np.asarray(x), batch, 0.5)
 
 
-@SLOW
-@pytest.mark.parametrize("backend", ["warp", "jax"])
-def test_run_chunk_in_boxes_that_shrink(backend):
-    """One system shrinks until its cutoff needs more images, while the other stays as it is."""
-    u, batch = jnp.asarray(np.random.default_rng(4).uniform(-1, 2, (18, 2))), np.arange(18, dtype=np.int32) % 2
-    first = jnp.array([[[2.0, 0.1], [0.3, 2.1]], [[3.0, 0.2], [0.0, 2.6]]])
-    ratio = jnp.array([0.9, 1.0])[:, None, None]
-
-    def positions_of(boxes):
-        return jnp.einsum("nd,ndk->nk", u, boxes[batch])
-
-    @jax.jit
-    def chunk(boxes, nbrs):
-        def step(_, carry):
-            boxes = carry[0] * ratio
-            return boxes, carry[1].update(positions_of(boxes), box=jfrnn.Box(boxes))
-
-        return jax.lax.fori_loop(0, 8, step, (boxes, nbrs))
-
-    nbrs = jfrnn.search(positions_of(first), 0.5, skin=0.1, box=jfrnn.Box(first), batch=batch, backend=backend)
-    assert nbrs.images is None
-    boxes, nbrs = jfrnn.run_chunk(chunk, first, nbrs, positions_of, box=jfrnn.Box)
-    nbrs.check()
-    assert nbrs.images is not None
-    assert masked_images(nbrs, positions_of(boxes)) == oracle(np.asarray(boxes), np.asarray(positions_of(boxes)), batch, 0.5)
-
-
 def test_numbers_without_a_box_are_told():
     x = jnp.zeros((3, 2))
     nbrs = jfrnn.search(x, 0.5, box=jfrnn.Box(np.ones((2, 2, 2)) + np.eye(2)), batch=np.array([0, 2, -1]), capacity=8)

@@ -196,28 +196,6 @@ def test_derivatives_in_coordinates_and_vectors_are_those_of_the_product(way, pe
             np.testing.assert_allclose(second, right, rtol=1e-8, atol=1e-9 * np.abs(right).max())
 
 
-@pytest.mark.slow
-def test_chunks_of_steps():
-    u = points(np.float64, 5)
-    box = lambda size: jfrnn.Box(size * 3 * jnp.asarray(SKEWED), fractional=True)  # noqa: E731
-
-    @jax.jit
-    def chunk(size, nbrs):
-        def step(_, carry):
-            size, nbrs = carry
-            return 0.9 * size, nbrs.update(u, box=box(0.9 * size))
-
-        return jax.lax.fori_loop(0, 5, step, (size, nbrs))
-
-    nbrs = jfrnn.search(u, 0.7, skin=0.1, box=jfrnn.Box(3 * SKEWED, fractional=True), capacity=32)
-    size, nbrs = jfrnn.run_chunk(chunk, jnp.asarray(1.0), nbrs, lambda size: u, box=box)
-    real, vectors = exact(u, float(size) * 3 * SKEWED, np.float64), np.asarray(nbrs.box.vectors)
-    assert nbrs.images is not None
-    assert masked_images(nbrs, u) == reference.reference_images(real, 0.7, matrix=vectors, periodic=[True] * 3)
-    graph = jax.jit(lambda nbrs, u: nbrs.to_jraph(u, 1024).nodes)(nbrs, u)
-    np.testing.assert_allclose(graph["positions"][:N], real, rtol=1e-12)
-
-
 def test_errors():
     u, box = points(np.float32), jfrnn.Box(SKEWED, fractional=True)
     with pytest.raises(TypeError, match="fractional must be True or False, known while tracing, got 'yes'"):

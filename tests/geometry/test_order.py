@@ -147,17 +147,6 @@ def test_decode_inverts_encode(curve, kind):
             np.testing.assert_array_equal(morton_decode(keys, dim), coords)
 
 
-@pytest.mark.parametrize("curve, dim, wide", [("morton", 2, True), ("hilbert", 3, False)])
-def test_jit_and_vmap_equal_eager(curve, dim, wide):
-    encode, decode = CURVES[curve]
-    with jax.enable_x64(wide):
-        coords = jnp.asarray(np.random.default_rng(2).integers(0, 2**20, (7, 5, dim)).astype(np.int32))
-        keys = encode(coords, 20)
-        for run in (jax.jit, lambda f: jax.vmap(jax.vmap(f))):
-            np.testing.assert_array_equal(run(lambda c: encode(c, 20))(coords), keys, strict=True)
-            np.testing.assert_array_equal(run(lambda k: decode(k, dim, 20))(keys), coords, strict=True)
-
-
 def test_concrete_arguments_inside_jit_are_checked(curve):
     outside = jnp.array([0, 16], jnp.int32)
     with pytest.raises(ValueError, match="got values from 0 to 16: give more bits"):

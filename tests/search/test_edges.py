@@ -114,21 +114,6 @@ def test_too_many_pairs_are_never_silent():
         assert np.isnan(edges.distance).all()
 
 
-def test_sums_by_receiver():
-    nbrs, x, _ = lists.make("full", "warp", "images")
-    total = int(np.asarray(nbrs.count).sum()) + 5
-
-    @jax.jit
-    def sums(nbrs, x):
-        edges = nbrs.edges(x, total)
-        messages = jnp.where(edges.mask, jnp.sum(edges.displacement**2, -1), 0)
-        return jax.ops.segment_sum(messages, edges.receivers, len(x), indices_are_sorted=True)
-
-    found, pairs, x = sums(nbrs, x), by_numpy.in_order(oracle("full", "images", x), 3), np.asarray(x)
-    r = by_numpy.vectors_of(pairs, x, x, np.diag(lists.BOXES["images"]))
-    np.testing.assert_allclose(found, by_numpy.add_up((r**2).sum(1), pairs.i, len(x)), rtol=1e-12)
-
-
 @pytest.mark.parametrize("box", ["open", "images"])
 def test_a_graph_has_two_graphs(box):
     nbrs, x, _ = lists.make("full", "warp", box)

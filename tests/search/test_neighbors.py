@@ -105,17 +105,6 @@ def test_gradients_are_finite_at_coincident_points(dim):
     assert nbrs.count[0] == 2
 
 
-def test_exports_agree(points):
-    nbrs = search(points, 0.3)
-    i, j = nbrs.pairs()
-    offsets, indices = nbrs.csr()
-    assert (i.dtype, j.dtype, indices.dtype, offsets.dtype) == (np.int32, np.int32, np.int32, np.int64)
-    np.testing.assert_array_equal(indices, j)
-    np.testing.assert_array_equal(np.diff(offsets), nbrs.count)
-    np.testing.assert_array_equal(np.repeat(np.arange(40), np.diff(offsets)), i)
-    assert set(zip(i.tolist(), j.tolist(), strict=True)) == reference.reference_pairs(np.asarray(points), 0.3)
-
-
 @pytest.mark.parametrize("n", [0, 1])
 def test_lists_without_pairs(n, dim):
     nbrs = jfrnn.search(np.zeros((n, dim), np.float32), 1.0)
@@ -134,12 +123,6 @@ def test_is_a_pytree_with_static_options(points):
     assert (again.cutoff, again.half, again.capacity, again.source_count) == (0.3, True, nbrs.capacity, 40)
     with pytest.raises(AttributeError, match="cannot assign"):
         nbrs.cutoff = 1.0
-
-
-def test_geometry_inside_jit_and_scan(points):
-    nbrs = jfrnn.search(points, 0.4, slack=2.0)
-    moved = jax.jit(lambda nbrs, x: nbrs.distances(x)[0].sum())(nbrs, points)
-    np.testing.assert_allclose(moved, np.asarray(nbrs.distances(points)[0]).sum(), rtol=1e-12)
 
 
 def test_refusals(points):

@@ -176,10 +176,11 @@ def test_non_finite_positions_set_a_bit_and_spare_the_others(value, backend, dty
         nbrs.check()
 
 
-@pytest.mark.parametrize("backend", ["warp", "jax"])
+@pytest.mark.parametrize("backend", ["warp", "hashgrid", "jax"])
 def test_non_finite_queries_set_the_bit(backend):
-    queries = np.array([[0.5, np.nan]], np.float32)
-    nbrs = jfrnn.search(random_points(10, 2, np.float32), 0.3, queries=queries, capacity=16, backend=backend)
+    points, queries = random_points(10, 2, np.float32), np.array([[0.5, np.nan], [0.5, 0.5]], np.float32)
+    nbrs = jfrnn.search(points, 0.3, queries=queries, capacity=16, backend=backend)
+    checked.assert_exact(nbrs, points, 0.3, queries=queries)
     assert jfrnn.Status(int(nbrs.status)) == jfrnn.Status.NONFINITE
     with pytest.raises(ValueError, match="queries"):
         nbrs.check()

@@ -97,14 +97,6 @@ def test_systems(backend):
     x, systems = points(120, "images"), np.arange(120) % 3
     nbrs = jfrnn.search_edges(x, CUTOFF, batch=systems, box=box_of("images"), backend=backend)
     assert_right(nbrs, x, {p for p in oracle(x, "images") if systems[p[0]] == systems[p[1]]})
-    cells = np.array([[0.5, 0.3, 1.0], [1.0, 1.0, 1.0], [0.4, 0.6, 0.8]], np.float32)
-    nbrs = jfrnn.search_edges(x, CUTOFF, batch=systems, box=jfrnn.Box(cells, per_system=True), backend=backend)
-    expected = set()
-    for system, cell in enumerate(cells):
-        members = np.flatnonzero(systems == system)
-        found = reference.reference_images(x[members], CUTOFF, matrix=cell, periodic=(True,) * 3)
-        expected |= {(members[i], members[j], shift) for i, j, shift in found}
-    assert_right(nbrs, x, expected)
 
 
 @pytest.mark.parametrize("backend", ["warp", pytest.param("brute", marks=SLOW)])
@@ -148,34 +140,6 @@ def test_a_chunk_is_replayed_with_a_larger_total():
     y, grown = jfrnn.run_chunk(chunk, x, nbrs, lambda x: x)
     assert grown.total > nbrs.total
     assert edges_as_set(grown.edges(y)) == oracle(np.asarray(y), "open")
-
-
-@SLOW
-@pytest.mark.parametrize(("half", "box"), [(False, "open"), *((half, "images") for half in (False, True))])
-@pytest.mark.parametrize("reverse", [True, False])
-def test_geometry_and_derivatives_are_those_of_padded_lists(half, box, reverse):
-    x = jnp.asarray(points(30, box, dtype=np.float64))
-    options = {"box": box_of(box, np.float64), "half": half, "skin": 0.02, "reverse": reverse, "backend": "warp"}
-    flat, padded = (find(x, CUTOFF, **options) for find in (jfrnn.search_edges, jfrnn.search))
-    moved = x + 0.005 * jnp.sin(40 * x)
-    flat, padded = flat.update(moved), padded.update(moved)
-    assert int(flat.rebuild_count) == 0
-
-    def energy(edges_of):
-        def f(x, a):
-            edges = edges_of(x, None if flat.box is None else jfrnn.Box(a))
-            return jnp.sum(jnp.where(edges.mask, jnp.sin(3 * edges.distance) * edges.displacement[:, 0], 0))
-
-        def all_of(x, a):
-            slope = jax.grad(f)
-            return f(x, a), jax.grad(f, (0, 1))(x, a), jax.jvp(lambda x: slope(x, a), (x,), (x,))[1]
-
-        return jax.jit(all_of)(moved, jnp.asarray(LENGTHS[box] or [1.0] * 3))
-
-    total = flat.total
-    of_flat, of_padded = energy(lambda x, b: flat.edges(x, box=b)), energy(lambda x, b: padded.edges(x, total, box=b))
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-10), of_flat, of_padded)
-    assert edges_as_set(flat.edges(moved)) == edges_as_set(padded.edges(moved, total))
 
 
 @pytest.mark.parametrize("half", [True, pytest.param(False, marks=SLOW)])
@@ -233,20 +197,6 @@ def test_graphs():
         jfrnn.search_edges(x, CUTOFF, skin=0.1, backend="warp").to_jraph(x)
     with pytest.raises(ValueError, match="this list has queries"):
         jfrnn.search_edges(x, CUTOFF, queries=x[:3], backend="warp").to_jraph(x)
-
-
-def test_vmap():
-    x = np.stack([points(seed=seed) for seed in (0, 1)])
-
-    def count_near(x):
-        nbrs = jfrnn.search_edges(x, CUTOFF, total=2000, backend="warp")
-        return nbrs.pair_count, jnp.sum(nbrs.edges(x).distance)
-
-    counts, sums = jax.jit(jax.vmap(count_near))(x)
-    for k in range(2):
-        i, j = np.array([pair[:2] for pair in oracle(x[k], "open")]).T
-        np.testing.assert_allclose(np.linalg.norm(x[k][j] - x[k][i], axis=1).sum(), sums[k], rtol=1e-5)
-        assert int(counts[k]) == len(i)
 
 
 @pytest.mark.parametrize(

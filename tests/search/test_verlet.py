@@ -253,19 +253,6 @@ def test_inactive_particles_have_no_neighbors_and_come_and_go(backend, dim):
         nbrs.update(x, active=np.arange(60) < 51).check()
 
 
-@pytest.mark.slow  # on Warp, test_transforms.py says it by default
-def test_vmap_is_a_loop():
-    x, moved = (jnp.stack([points(40, 2, np.float32, s) for s in seeds]) for seeds in ((0, 1, 2), (0, 1, 3)))
-    lists = [jfrnn.search(one, CUTOFF, skin=SKIN, capacity=40, backend="jax") for one in x]
-    batch = jax.vmap(lambda one: jfrnn.search(one, CUTOFF, skin=SKIN, capacity=40, backend="jax"))(x)
-    after = jax.vmap(lambda nbrs, one: nbrs.update(one))(batch, moved)
-    for k, (nbrs, one) in enumerate(zip(lists, moved, strict=True)):
-        expected = nbrs.update(one)
-        for got, wanted in zip(jax.tree.leaves(after), jax.tree.leaves(expected), strict=True):
-            np.testing.assert_array_equal(got[k], wanted)
-    assert after.rebuild_count.tolist() == [0, 0, 1]
-
-
 def test_gradients_flow_around_updates():
     x = np.random.default_rng(0).random((30, 2))
 

@@ -245,18 +245,6 @@ def test_a_loop_with_a_wall_that_moves():
             ask(after, vertices=lifted[:, :2])
 
 
-@pytest.mark.parametrize("backend", [pytest.param("jax", marks=pytest.mark.slow), "warp", "bvh"])
-def test_vmap_is_a_loop(backend):
-    vertices, faces = wall()
-    x = np.random.default_rng(1).uniform(-0.2, 1.2, (2, 4, 3)).astype(np.float32)
-    one = functools.partial(jfrnn.search_triangles, vertices=vertices, faces=faces, cutoff=0.5, capacity=2, backend=backend)
-    idx, count = jax.jit(jax.vmap(lambda x: (one(x).idx, one(x).count)))(x)
-    for b in range(2):
-        alone = one(x[b])
-        assert np.array_equal(np.asarray(idx)[b], alone.idx)
-        assert np.array_equal(np.asarray(count)[b], alone.count)
-
-
 @pytest.mark.parametrize("backend", IN_CELLS)
 def test_buckets_are_shared_without_harm(monkeypatch, backend):
     """All cells hashed into two buckets: candidates are many, pairs the same, and squares of lengths are no floats."""

@@ -389,12 +389,3 @@ def test_a_count_that_is_not_known_is_no_number():
     with pytest.raises(ValueError, match=r"needs images=\(3, 3, 3\)"):
         jfrnn.search(x, 6.0, box=jfrnn.Box(cell, images=1), capacity=80).check()
     assert re.search("images_for", Status.BOX_TOO_SMALL.message)
-
-
-def test_inactive_particles_may_be_anything():
-    active = np.arange(N) != BAD
-    expected = jfrnn.count(np.delete(X, BAD, axis=0), CUTOFF)
-    for jit in (lambda f: f, jax.jit):
-        found = jit(lambda x: jfrnn.count(x, CUTOFF, active=active))(damaged(np.nan))
-        np.testing.assert_array_equal(np.delete(found, BAD), expected)
-        assert int(found[BAD]) == 0

@@ -31,6 +31,7 @@ LISTS = {
     "radii in a box": lambda x: jfrnn.search(x, 0.1 + 0.2 * x[:, 0], box=BOX, **OPTIONS),
     "batch": lambda x: jfrnn.search(x, CUTOFF, batch=(4 * x[:, 0]).astype(jnp.int32), **OPTIONS),
     "hashgrid": lambda x: jfrnn.search(x, CUTOFF, capacity=CAPACITY, backend="hashgrid"),
+    "a box of its own": lambda x: jfrnn.search(x, CUTOFF, box=jfrnn.Box(1.0 + x[0]), **OPTIONS),
 }
 
 
@@ -46,6 +47,7 @@ FUNCTIONS = {
     "count, hashgrid": lambda x: jfrnn.count(x, CUTOFF, backend="hashgrid"),
     "count, box per system": lambda x: jfrnn.count(x, CUTOFF, box=jfrnn.Box(1.0 + x[0]), backend="warp"),
     "search_edges": lambda x: jfrnn.search_edges(x, CUTOFF, total=300, backend="warp"),
+    "edges of a flat list": lambda x: jfrnn.search_edges(x, CUTOFF, total=300, backend="warp").edges(x),
     "update": lambda x: LISTS["open"](x).update(x + 0.1),
     "update, skin": lambda x: LISTS["skin"](x).update(x + jnp.where(x[0, 0] > 0.5, 0.1, 0.0).astype(x.dtype)),
     "update, box": lambda x: LISTS["box"](x).update(x + 0.1),
@@ -63,6 +65,7 @@ FUNCTIONS = {
     "to_jax_md": lambda x: LISTS["open"](x).to_jax_md(),
     "pair_sum": lambda x: jfrnn.pair_sum(lambda r, i, j: {"r": r * j, "s": r @ r}, x, None, x[:, 0], neighbors=LISTS["open"](x)),
     "search_triangles": lambda x: jfrnn.search_triangles(x, *SEGMENTS, 0.2, capacity=4, backend="warp"),
+    "search_triangles, bvh": lambda x: jfrnn.search_triangles(x, *SEGMENTS, 0.2, capacity=4, backend="bvh"),
     "search_triangles, jax": lambda x: jfrnn.search_triangles(x, *SEGMENTS, 0.2, capacity=4, backend="jax"),
     "closest": lambda x: jfrnn.search_triangles(x, *SEGMENTS, 0.2, capacity=4, backend="warp").closest(x),
     "contacts": lambda x: jfrnn.search_triangles(x, *SEGMENTS, 0.2, capacity=4, backend="warp").contacts(x),
