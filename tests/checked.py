@@ -1,13 +1,32 @@
-"""Search, and compare what came back with the oracle as a set of pairs. Shapes and dtypes are checked on the way."""
+"""Search, and compare what came back with the oracle as a set of pairs. Shapes and dtypes are checked on the way.
+
+And which parameters of a test are for runs by hand.
+"""
 
 import jax
 import numpy as np
+import pytest
 import reference
 from beartype import beartype
 from jax import Array
 from jaxtyping import Bool, Int32, jaxtyped
 
 import jfrnn
+
+
+def slow(*values, **more):
+    """Return parameters of a test that runs by hand."""
+    return pytest.param(*values, marks=pytest.mark.slow, **more)
+
+
+def slowly(*cases):
+    """Return parameters of tests that all run by hand."""
+    return [slow(*case) for case in cases]
+
+
+def sparing(cases, often):
+    """Return parameters of tests, of which only those that stand in `often` run by default."""
+    return [case if case in often else slow(*case) for case in map(tuple, cases)]
 
 
 @jaxtyped(typechecker=beartype)

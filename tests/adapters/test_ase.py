@@ -12,6 +12,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import reference
+from checked import slow
 
 import jfrnn.ase
 import jfrnn.matscipy
@@ -44,8 +45,8 @@ ODD, EVEN = (list(PERIODIC_CASES)[k::2] for k in (1, 0))
     [
         pytest.param(np.float32, 2, ODD, id="f32-2d-odd"),
         pytest.param(np.float64, 3, EVEN, id="f64-3d-even"),
-        pytest.param(np.float32, 2, EVEN, id="f32-2d-even", marks=pytest.mark.slow),
-        pytest.param(np.float64, 3, ODD, id="f64-3d-odd", marks=pytest.mark.slow),
+        slow(np.float32, 2, EVEN, id="f32-2d-even"),
+        slow(np.float64, 3, ODD, id="f64-3d-odd"),
     ],
 )
 def test_hard_cases(dtype, dim, names):

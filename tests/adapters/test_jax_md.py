@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
+from checked import slow, slowly, sparing
 
 from jfrnn import jax_md
 
@@ -71,10 +72,7 @@ def expected(x, space, form, skin=SKIN):
 OFTEN = [("free", jax_md.Dense), ("periodic", jax_md.OrderedSparse)]  # fractions: where boxes change
 
 
-@pytest.mark.parametrize(
-    ("space", "form"),
-    [pytest.param(*each, marks=[pytest.mark.slow] * (each not in OFTEN)) for each in itertools.product(SPACES, FORMATS)],
-)
+@pytest.mark.parametrize(("space", "form"), sparing(itertools.product(SPACES, FORMATS), OFTEN))
 def test_pairs_in_a_loop(space, form):
     displacement, box, fractional = SPACES[space]
     fns = jax_md.neighbor_list(displacement, box, CUTOFF, SKIN, fractional_coordinates=fractional, format=form)
@@ -103,8 +101,8 @@ def test_pairs_in_a_loop(space, form):
     [
         (jax_md.Dense, False),
         (jax_md.Sparse, True),
-        *(pytest.param(*each, marks=pytest.mark.slow) for each in ((jax_md.Dense, True), (jax_md.Sparse, False))),
-        *(pytest.param(jax_md.OrderedSparse, each, marks=pytest.mark.slow) for each in (True, False)),
+        *slowly((jax_md.Dense, True), (jax_md.Sparse, False)),
+        *(slow(jax_md.OrderedSparse, each) for each in (True, False)),
     ],
 )
 def test_what_is_no_space_of_ours_is_measured(form, euclidean):
@@ -142,7 +140,7 @@ def test_room():
         assert ((0, 0) in pairs_of(own.idx, N, form)) == (form is not jax_md.OrderedSparse)
 
 
-@pytest.mark.parametrize("form", [jax_md.Dense, jax_md.OrderedSparse, pytest.param(jax_md.Sparse, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("form", [jax_md.Dense, jax_md.OrderedSparse, slow(jax_md.Sparse)])
 def test_masks_come_before_room(form):
     displacement, box, _ = SPACES["periodic"]
     molecule = np.arange(N + 1) // 4

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
+from checked import slow
 
 import jfrnn
 from jfrnn._engine import arrays, blocks, tuning
@@ -46,7 +47,7 @@ def test_numbers_of_accelerators_find_the_same_pairs(name, elsewhere):
 @pytest.mark.parametrize(
     ("name", "numbers"),
     [
-        (name, numbers) if (name, numbers) == ("lattice_1e-4_at_0", "AT_ONCE") else pytest.param(name, numbers, marks=SLOW)
+        (name, numbers) if (name, numbers) == ("lattice_1e-4_at_0", "AT_ONCE") else slow(name, numbers)
         for name in TIES
         for numbers in ("AT_ONCE", "LOOPS")
     ],
@@ -64,9 +65,7 @@ LENGTHS = {"images": [1.0, 0.3, 1.0], "nearest images": [1.0, 1.0, 1.0]}
 
 
 @pytest.mark.usefixtures("elsewhere")
-@pytest.mark.parametrize(
-    "kind", ["images", *(pytest.param(kind, marks=SLOW) for kind in ("batch", "half", "nearest images", "a cutoff per particle"))]
-)
+@pytest.mark.parametrize("kind", ["images", *(slow(kind) for kind in ("batch", "half", "nearest images", "a cutoff per particle"))])
 def test_options_with_the_numbers_of_accelerators(kind):
     x, cutoff, lengths, options = SOME, 0.2, LENGTHS.get(kind), {}
     if kind == "a cutoff per particle":
@@ -149,7 +148,7 @@ def spring(r, i, j):
 
 
 @pytest.mark.usefixtures("elsewhere")
-@pytest.mark.parametrize("kind", ["few", pytest.param("many", marks=SLOW), pytest.param("ties", marks=SLOW)])
+@pytest.mark.parametrize("kind", ["few", slow("many"), slow("ties")])
 def test_sums_with_the_numbers_of_accelerators(kind):
     """At once, with more neighbors than that allows, and with more doubtful candidates."""
     rng = np.random.default_rng(2)

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
+from checked import slow, slowly, sparing
 
 import jfrnn
 from jfrnn._engine import ARRAYS
@@ -39,7 +40,6 @@ LISTS = {
 CAPACITY = {"half short vectors": 640}  # given: a program that counts would be compiled besides
 REVERSED = ("half", "queries")
 N, ASKING, CUTOFF = 90, 31, 0.3
-SLOW = pytest.mark.slow
 
 
 def by_arrays(nbrs):
@@ -94,10 +94,7 @@ OFTEN = [("open", np.float64), ("nearest", np.float64), ("half images", np.float
 OFTEN += [("gather", np.float32), ("both", np.float32)]
 
 
-@pytest.mark.parametrize(
-    ("name", "dtype"),
-    [pytest.param(*each, marks=[SLOW] * (each not in OFTEN)) for each in product(LISTS, (np.float32, np.float64))],
-)
+@pytest.mark.parametrize(("name", "dtype"), sparing(product(LISTS, (np.float32, np.float64)), OFTEN))
 def test_pairs_at_new_positions(name, dtype):
     nbrs, x, q = made(name, dtype)
     found = nbrs.vectors(x, queries=q)
@@ -111,9 +108,7 @@ LATTICES += [(np.float64, *kind, scale) for kind in ((2, True), (3, False)) for 
 EVERY = product((np.float32, np.float64), (2, 3), (False, True), SCALES)
 
 
-@pytest.mark.parametrize(
-    ("dtype", "dim", "closed", "scale"), [pytest.param(*given, marks=[SLOW] * (given not in LATTICES)) for given in EVERY]
-)
+@pytest.mark.parametrize(("dtype", "dim", "closed", "scale"), sparing(EVERY, LATTICES))
 def test_ties_are_decided_exactly(scale, dtype, dim, closed):
     """All points on a lattice, in a list of all of them: rows full of pairs at exactly the cutoff, or as near as floats allow."""
     grid = np.stack(np.meshgrid(*[np.arange(4)] * dim, indexing="ij"), -1).reshape(-1, dim)
@@ -130,7 +125,7 @@ def test_ties_are_decided_exactly(scale, dtype, dim, closed):
 
 @pytest.mark.parametrize(
     ("dtype", "length"),
-    [(np.float32, 4.0), (np.float32, 5.0), (np.float64, 4.0), pytest.param(np.float64, 5.0, marks=SLOW)],
+    [(np.float32, 4.0), (np.float32, 5.0), (np.float64, 4.0), slow(np.float64, 5.0)],
     ids=["f32-4.0", "f32-5.0", "f64-4.0", "f64-5.0"],
 )
 def test_ties_of_images_are_decided_exactly(length, dtype):
@@ -220,7 +215,7 @@ MORE = (
 )
 
 
-@pytest.mark.parametrize(("name", "compensated", "twice"), [*SUMMED, *(pytest.param(*more, marks=SLOW) for more in MORE)])
+@pytest.mark.parametrize(("name", "compensated", "twice"), [*SUMMED, *slowly(*MORE)])
 def test_sums_and_derivatives(name, compensated, twice):
     """Of first order, and where kinds of lists differ in how pairs are passed on (`twice`) of second order."""
     nbrs, x, q = made(name)
@@ -231,11 +226,7 @@ def test_sums_and_derivatives(name, compensated, twice):
 
 @pytest.mark.parametrize(
     ("name", "twice"),
-    [
-        ("skewed images", True),
-        pytest.param("half mean", False, marks=SLOW),
-        *(pytest.param(name, True, marks=SLOW) for name in LISTS if name != "skewed images"),
-    ],
+    [("skewed images", True), slow("half mean", False), *(slow(name, True) for name in LISTS if name != "skewed images")],
 )
 def test_array_programs_find_and_sum_the_same(name, twice):
     nbrs, x, q = made(name)
@@ -246,10 +237,7 @@ def test_array_programs_find_and_sum_the_same(name, twice):
 
 @pytest.mark.parametrize(
     ("name", "reduce"),
-    [
-        *(("images", "min"), ("queries", "max")),
-        *(pytest.param(*more, marks=SLOW) for more in (("open", "max"), ("open", "min"), ("images", "max"), ("queries", "min"))),
-    ],
+    [*(("images", "min"), ("queries", "max")), *slowly(("open", "max"), ("open", "min"), ("images", "max"), ("queries", "min"))],
 )
 def test_extremes(name, reduce):
     nbrs, x, q = made(name)
@@ -352,7 +340,7 @@ def test_vmap():
         np.testing.assert_allclose(found, by_numpy.pull(pairs, 4 * r**3, x), rtol=1e-12, atol=1e-13)
 
 
-@pytest.mark.parametrize("dtype", [pytest.param(np.float32, marks=SLOW), np.float64])
+@pytest.mark.parametrize("dtype", [slow(np.float32), np.float64])
 def test_particles_that_are_not_finite(dtype):
     nbrs, x, _ = made("nearest", dtype)
     x = np.array(x)

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
+from checked import slow
 from test_box import image_pairs, masked_images
 
 import jfrnn
@@ -90,7 +91,7 @@ def test_case_with_a_cutoff_per_particle(name, dtype, dim, backend):
     assert_case(name, dtype, dim, backend, radii=True, radius_rule=rule)
 
 
-@pytest.mark.parametrize("rule", ["gather", pytest.param("either", marks=SLOW)])
+@pytest.mark.parametrize("rule", ["gather", slow("either")])
 def test_systems_on_top_of_each_other_whose_cutoffs_differ_widely(rule):
     """Most particles of each system stand in one place, with tiny cutoffs: sources are sorted into a tree."""
     random, systems, n, crowd = np.random.default_rng(0), 3, 180, 120
@@ -107,7 +108,7 @@ def test_systems_on_top_of_each_other_whose_cutoffs_differ_widely(rule):
     assert set(reference.pairs_of(np.asarray(nbrs.idx), np.asarray(nbrs.count), len(x))) == expected
 
 
-@pytest.mark.parametrize("backend", ["warp", pytest.param("jax", marks=SLOW)])
+@pytest.mark.parametrize("backend", ["warp", slow("jax")])
 def test_closed_and_half(backend):
     assert_case("ties", np.float32, 3, backend, closed=True)
     nbrs, *_ = search_case("ties", np.float32, 3, backend, half=True)
@@ -169,7 +170,7 @@ def test_errors(error, match, options):
             function(X, 1.0, **options)
 
 
-@pytest.mark.parametrize("wide", [np.int64, *(pytest.param(wide, marks=SLOW) for wide in (np.uint32, np.uint64))])
+@pytest.mark.parametrize("wide", [np.int64, *(slow(wide) for wide in (np.uint32, np.uint64))])
 def test_wide_numbers_of_systems_and_species_are_taken_inside_jit(wide):
     """As outside; a number that int32 does not hold sets the bit, and its particle has no neighbors."""
     x = np.random.default_rng(0).random((30, 3)).astype(np.float32)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import reference
 from by_numpy import in_order
+from checked import slow, sparing
 
 import jfrnn
 from jfrnn._geometry.images import images_of
@@ -156,9 +157,7 @@ OFTEN = [
 ALL = product((np.float32, np.float64), ("nearest", "images"), (HALF, SELF, HALF | SELF))
 
 
-@pytest.mark.parametrize(
-    ("dtype", "vectors", "options"), [pytest.param(*x, marks=[pytest.mark.slow] * (x not in OFTEN)) for x in ALL], ids=str
-)
+@pytest.mark.parametrize(("dtype", "vectors", "options"), sparing(ALL, OFTEN), ids=str)
 def test_options(options, vectors, dtype):
     """Of two opposite images of a particle itself, half lists have one."""
     x, (vectors, cutoff) = points(40, dtype), {"nearest": (LENGTHS, 0.3), "images": (SMALL, 0.6)}[vectors]
@@ -213,7 +212,7 @@ def test_a_traced_box_with_images():
     assert jfrnn.Status.BOX_TOO_SMALL in jfrnn.Status(int(found(x, jnp.asarray(0.25 * LENGTHS)).status))
 
 
-@pytest.mark.parametrize("backend", [pytest.param("jax", marks=pytest.mark.slow), "warp"])
+@pytest.mark.parametrize("backend", [slow("jax"), "warp"])
 def test_out_of_range_positions_set_a_bit_and_spare_the_others(backend):
     x = points(30, np.float32).at[7, 1].set(1e7)
     nbrs = jfrnn.search(x, 0.3, box=jfrnn.Box(LENGTHS), backend=backend)
@@ -243,14 +242,7 @@ def energy_and_slopes(x, boxes, pairs, systems, cutoff):
 
 
 @pytest.mark.parametrize(
-    "vectors",
-    [
-        pytest.param(LENGTHS, marks=pytest.mark.slow),
-        pytest.param(SKEWED, marks=pytest.mark.slow),
-        pytest.param(SMALL, marks=pytest.mark.slow),
-        0.6 * SKEWED,
-    ],
-    ids=["lengths", "skewed", "images", "skewed images"],
+    "vectors", [slow(LENGTHS), slow(SKEWED), slow(SMALL), 0.6 * SKEWED], ids=["lengths", "skewed", "images", "skewed images"]
 )
 def test_gradients_in_positions_and_box(vectors):
     """First and second derivatives of a sum over the oracle's pairs; the second are those of a complex step."""
@@ -294,12 +286,12 @@ LONG = np.array([[1.0, 0.0, 0.0], [30.3, 1.1, 0.0], [-17.2, 21.1, 0.9]]) @ np.li
 @pytest.mark.parametrize(
     ("backend", "kind", "options"),
     [
-        pytest.param("warp", np.float32, {}, marks=pytest.mark.slow),
+        slow("warp", np.float32, {}),
         ("warp", np.float32, {"half": True}),
         ("warp", np.float64, {"queries": 5}),
-        pytest.param("jax", np.float32, {"half": True}, marks=pytest.mark.slow),
-        pytest.param("brute", np.float64, {"periodic": (True, True, False)}, marks=pytest.mark.slow),
-        pytest.param("jax", np.float64, {}, marks=pytest.mark.slow),
+        slow("jax", np.float32, {"half": True}),
+        slow("brute", np.float64, {"periodic": (True, True, False)}),
+        slow("jax", np.float64, {}),
     ],
     ids=str,
 )
@@ -338,7 +330,7 @@ DIAMOND = 3.567 / 2 * np.array([[0.0, 1.0, 1.0], [1.0, 0.0, 1.0], [1.0, 1.0, 0.0
     ("cell", "cutoff", "counts"),
     [
         ([[3.0, 0.0, 0.0], [900.0, 3.0, 0.0], [0.0, 0.0, 3.0]], 6.0, [26]),
-        pytest.param(DIAMOND, 95 * 0.529177210903, [94004, 94004], marks=pytest.mark.slow),  # at 95 bohr
+        slow(DIAMOND, 95 * 0.529177210903, [94004, 94004]),  # at 95 bohr
     ],
     ids=["one particle in a skewed cell", "diamond"],
 )
@@ -395,7 +387,7 @@ def test_bad_boxes_say_what_is_wrong(error, match, make):
     ("vectors", "cutoff", "dtype"),
     [
         (LENGTHS, 0.3, np.float32),
-        pytest.param(LENGTHS, 0.5, np.float64, marks=pytest.mark.slow),
+        slow(LENGTHS, 0.5, np.float64),
         (SMALL, 0.3, np.float64),
         (SKEWED, 0.6, np.float32),
         (LENGTHS, 3.1, np.float32),

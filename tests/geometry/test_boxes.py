@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import reference
 from by_numpy import in_order
-from checked import padded
+from checked import padded, slow
 from test_box import LONG, energy_and_slopes, masked_images, unpacked
 
 import jfrnn
@@ -124,7 +124,7 @@ def test_case(name, dtype, dim, backend):
     assert_case(name, dtype, dim, backend, geometry=geometry, pad=not own_program)
 
 
-@pytest.mark.parametrize("backend", ["warp", pytest.param("jax", marks=SLOW), pytest.param("brute", marks=SLOW)])
+@pytest.mark.parametrize("backend", ["warp", slow("jax"), slow("brute")])
 def test_closed_and_half(backend):
     assert_case("ties", np.float64, 2, backend, closed=True)
     assert_case("ties", np.float64, 2, backend, half=True)
@@ -141,7 +141,7 @@ def crystals(dtype=np.float64, dim=2):
     return jnp.asarray(given.positions), given.batch, jnp.asarray(given.boxes)
 
 
-@pytest.mark.parametrize("backend", ["warp", pytest.param("jax", marks=SLOW)])
+@pytest.mark.parametrize("backend", ["warp", slow("jax")])
 def test_skin_in_moving_boxes(backend):
     """Particles drift, boxes breathe and positions are wrapped: every step holds exactly the pairs of that step."""
     rng, (x, batch, boxes) = np.random.default_rng(0), [np.asarray(part) for part in crystals(np.float32)]
@@ -161,7 +161,7 @@ def test_skin_in_moving_boxes(backend):
     nbrs.check()
 
 
-@pytest.mark.parametrize("ways", [("distances", "list"), pytest.param(("edges", "sum"), marks=SLOW)], ids="-".join)
+@pytest.mark.parametrize("ways", [("distances", "list"), slow(("edges", "sum"))], ids="-".join)
 def test_derivatives_in_positions_and_boxes(ways):
     """Sums over the pairs of the oracle, and their derivatives."""
     x, batch, boxes = crystals()
@@ -198,7 +198,7 @@ def test_derivatives_in_positions_and_boxes(ways):
     assert not of_boxes[1].any()  # no particle is in that system
 
 
-@pytest.mark.parametrize("backend", ["warp", pytest.param("jax", marks=SLOW), pytest.param("brute", marks=SLOW)])
+@pytest.mark.parametrize("backend", ["warp", slow("jax"), slow("brute")])
 def test_known_numbers_of_neighbors_at_long_cutoffs(backend):
     """Diamond, 2 atoms in its primitive cell, at 95 bohr; and single particles in cubic cells, whose neighbors integers count."""
     edge, cutoff = 3.567, 95 * 0.529177210903
@@ -224,13 +224,7 @@ def test_known_numbers_of_neighbors_at_long_cutoffs(backend):
 
 @pytest.mark.parametrize(
     ("backend", "options"),
-    [
-        pytest.param("warp", {}, marks=SLOW),
-        pytest.param("warp", {"half": True}, marks=SLOW),
-        pytest.param("jax", {}, marks=SLOW),
-        pytest.param("jax", {"half": True}, marks=SLOW),
-        pytest.param("brute", {}, marks=SLOW),
-    ],
+    [slow("warp", {}), slow("warp", {"half": True}), slow("jax", {}), slow("jax", {"half": True}), slow("brute", {})],
     ids=str,
 )
 def test_lattices_far_from_reduced(backend, options):

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import reference
 from by_numpy import in_order
+from checked import slow
 from test_box import masked_images, pull_back
 from test_boxes import box_of, listed_images, system_by_system
 
@@ -100,8 +101,8 @@ def test_case(name, who, dtype, dim, backend):
     assert len(expected) > 0 and nbrs.backend == backend
 
 
-@pytest.mark.parametrize("backend", ["warp", pytest.param("jax", marks=SLOW), pytest.param("brute", marks=SLOW)])
-@pytest.mark.parametrize("who", ["table", pytest.param("either", marks=SLOW)])
+@pytest.mark.parametrize("backend", ["warp", slow("jax"), slow("brute")])
+@pytest.mark.parametrize("who", ["table", slow("either")])
 def test_options_and_flat_lists(who, backend):
     given = scene("mixed", np.float32, 2, who)
     exclude = np.random.default_rng(2).integers(0, len(given.x), (40, 2))
@@ -156,7 +157,7 @@ WAYS = [("mean", "warp", "search")]
 MORE = [(who, backend, way) for who in (*RULES, "table") for backend in ("warp", "jax", "brute") for way in ("search", "list")]
 
 
-@pytest.mark.parametrize(("who", "backend", "way"), [*WAYS, *(pytest.param(*x, marks=SLOW) for x in MORE if x not in WAYS)])
+@pytest.mark.parametrize(("who", "backend", "way"), [*WAYS, *(slow(*x) for x in MORE if x not in WAYS)])
 def test_sums_and_derivatives_in_positions_and_boxes(who, backend, way):
     """Sums over the oracle's pairs, their gradient, and with a table that of its norm, by a complex step."""
     given = scene("mixed", np.float64, 2, who)
@@ -202,7 +203,7 @@ def test_sums_and_derivatives_in_positions_and_boxes(who, backend, way):
         np.testing.assert_allclose(along, right, rtol=1e-9)
 
 
-@pytest.mark.parametrize("backend", ["warp", pytest.param("jax", marks=SLOW)])
+@pytest.mark.parametrize("backend", ["warp", slow("jax")])
 def test_what_is_wrong_sets_bits_and_absent_particles_may_have_any_cutoff(backend):
     given = scene("absent", np.float32, 2, "either")
     gone, radii = given.given.batch < 0, given.cutoff.copy()

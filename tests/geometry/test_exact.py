@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
+from checked import slow, sparing
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
@@ -44,11 +45,7 @@ OFTEN = [("warp", np.float32), ("warp", np.float64), ("hashgrid", np.float32)]  
 @hypothesis.settings(max_examples=50, deadline=None)
 @hypothesis.given(st.data())
 @pytest.mark.parametrize(
-    ("backend", "dtype"),
-    [
-        pytest.param(*each, marks=[pytest.mark.slow] * (each not in OFTEN))
-        for each in itertools.product(("warp", "hashgrid", "jax", "brute"), (np.float32, np.float64))
-    ],
+    ("backend", "dtype"), sparing(itertools.product(("warp", "hashgrid", "jax", "brute"), (np.float32, np.float64)), OFTEN)
 )
 def test_any_floats(backend, dtype, data):
     points = data.draw(hnp.arrays(dtype, (POINTS, 3), elements=floats(dtype)))
@@ -113,7 +110,7 @@ def assert_signs(found, exact, known):
     np.testing.assert_array_equal(integer, exact)
 
 
-@pytest.mark.parametrize("offset", [0.0, pytest.param(-3.0, marks=pytest.mark.slow), 1e4])
+@pytest.mark.parametrize("offset", [0.0, slow(-3.0), 1e4])
 def test_every_step_agrees_with_fractions(dtype, offset):
     a, b = ulp_pairs(dtype, seed=5, offset=offset)
     exact = np.array(
@@ -130,10 +127,7 @@ OFTEN_IN_LATTICES = [
 ]  # the wide integers of float64 take long to compile
 
 
-@pytest.mark.parametrize(
-    ("size", "orthogonal", "dtype"),
-    [pytest.param(*each, marks=[pytest.mark.slow] * (each not in OFTEN_IN_LATTICES)) for each in LATTICES],
-)
+@pytest.mark.parametrize(("size", "orthogonal", "dtype"), sparing(LATTICES, OFTEN_IN_LATTICES))
 def test_steps_agree_in_lattices(size, orthogonal, dtype):
     """Ties and near ties on a coarse lattice of points, far from the origin too, with images a few to a thousand cells away."""
     rng = np.random.default_rng(11)

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
+from checked import slow
 
 import jfrnn
 from jfrnn._geometry.far import move_near
@@ -194,7 +195,7 @@ def test_what_lies_beyond_sets_a_bit():
     assert status(2.7 * 400, skewed) == jfrnn.Status.OK
 
 
-@pytest.mark.parametrize("backend", ["warp", *(pytest.param(name, marks=SLOW) for name in ("jax", "brute"))])
+@pytest.mark.parametrize("backend", ["warp", *(slow(name) for name in ("jax", "brute"))])
 def test_in_skewed_cells_those_that_rounding_would_move_are_named(backend):
     """Beyond 511 vectors, points are taken whose move is exact; the others have no neighbors, and the error names one."""
     x, matrix = scene("fcc", 700, np.float32)

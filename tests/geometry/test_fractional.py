@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import reference
 from by_numpy import in_order
+from checked import slow
 from test_box import image_pairs, masked_images, pull_back
 from test_boxes import oracle as oracle_of_systems
 
@@ -15,7 +16,6 @@ import jfrnn
 import jfrnn.distributed
 from jfrnn._search.fractional import real_points
 
-SLOW = pytest.mark.slow
 SKEWED = np.array([[1.0, 0.0, 0.0], [0.45, 0.9, 0.0], [-0.3, 0.35, 1.1]])
 BOXES = {
     "skewed": (SKEWED, True, 0.7),
@@ -70,7 +70,7 @@ OFTEN = [("skewed", np.float32, "warp")]
 ALL = [(name, dtype, backend) for name in BOXES for dtype in (np.float32, np.float64) for backend in ("warp", "jax", "brute")]
 
 
-@pytest.mark.parametrize(("name", "dtype", "backend"), [*OFTEN, *(pytest.param(*x, marks=SLOW) for x in ALL if x not in OFTEN)])
+@pytest.mark.parametrize(("name", "dtype", "backend"), [*OFTEN, *(slow(*x) for x in ALL if x not in OFTEN)])
 def test_lists_and_flat_lists(name, dtype, backend):
     (vectors, periodic, cutoff), u, q = BOXES[name], points(dtype), points(dtype, 1, 7)
     real, asking = exact(u, vectors, dtype), exact(q, vectors, dtype)
@@ -147,10 +147,8 @@ def smooth_in_numpy(r):
     return (0.7 - s) ** 3 * factor, of_length[:, None] * r + ((0.7 - s) ** 3)[:, None] * np.eye(3)[0]
 
 
-@pytest.mark.parametrize("per_system", [True, pytest.param(False, marks=SLOW)])
-@pytest.mark.parametrize(
-    "way", ["first", *(pytest.param(way, marks=SLOW) for way in ("search", "list", "edges", "vectors", "jax"))]
-)
+@pytest.mark.parametrize("per_system", [True, slow(False)])
+@pytest.mark.parametrize("way", ["first", *(slow(way) for way in ("search", "list", "edges", "vectors", "jax"))])
 def test_derivatives_in_coordinates_and_vectors_are_those_of_the_product(way, per_system):
     """Derivatives of sums over the oracle's pairs, after "first" also the second ones in one direction, by a complex step."""
     u, batch = np.asarray(points(np.float64, 4)), np.arange(N) % 3 if per_system else np.zeros(N, int)

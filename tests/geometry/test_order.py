@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from checked import slow
 
 from jfrnn._geometry.curves import hilbert_decode, hilbert_encode, morton_decode, morton_encode
 from jfrnn._geometry.order import sort_order
@@ -387,7 +388,7 @@ def test_jit_and_vmap_order_as_eager_does(any_curve):
     np.testing.assert_array_equal(jax.vmap(order)(x), eager, strict=True)
 
 
-@pytest.mark.parametrize("dim", [pytest.param(2, marks=pytest.mark.slow), 3])
+@pytest.mark.parametrize("dim", [slow(2), 3])
 def test_curves_bring_neighbors_together(dim):
     """Mean distance of particles that follow each other: Hilbert below Morton below a tenth of the input order."""
     x = np.random.default_rng(12).uniform(0, 1, (20_000, dim))

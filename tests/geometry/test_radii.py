@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
+from checked import slow
 from test_box import image_pairs, masked_images
 
 import jfrnn
@@ -122,8 +123,8 @@ def test_a_tree_wherever_cutoffs_differ(rule, monkeypatch):
     jax.clear_caches()
 
 
-@pytest.mark.parametrize("backend", ["warp", pytest.param("jax", marks=SLOW)])
-@pytest.mark.parametrize("rule", ["mean", *(pytest.param(rule, marks=SLOW) for rule in RULES if rule != "mean")])
+@pytest.mark.parametrize("backend", ["warp", slow("jax")])
+@pytest.mark.parametrize("rule", ["mean", *(slow(rule) for rule in RULES if rule != "mean")])
 def test_ties_when_closed(rule, backend):
     for name in ("ties", "ties_far", "coincident", "mean_residues"):
         assert_case(name, *KINDS[rule], rule, backend, closed=True)
@@ -218,7 +219,7 @@ def test_a_radius_of_0_on_every_engine(backend, rule, box, closed, dtype, dim):
     assert_radii_of_0(dtype, dim, rule, backend, closed=closed, box=box)
 
 
-@pytest.mark.parametrize("backend", ["warp", "jax", pytest.param("brute", marks=SLOW)])
+@pytest.mark.parametrize("backend", ["warp", "jax", slow("brute")])
 def test_a_mean_with_0_reaches_half_as_far(backend):
     """As many points as in other tests, so that they share programs: most of them are nowhere."""
     x, radii = np.zeros((2, 3)), np.array([0.0, 3.0])
@@ -257,8 +258,8 @@ def spheres(dtype):
     return x, h
 
 
-@pytest.mark.parametrize("dtype", [np.float32, pytest.param(np.float64, marks=SLOW)])
-@pytest.mark.parametrize("backend", ["warp", pytest.param("brute", marks=SLOW), pytest.param("jax", marks=SLOW)])
+@pytest.mark.parametrize("dtype", [np.float32, slow(np.float64)])
+@pytest.mark.parametrize("backend", ["warp", slow("brute"), slow("jax")])
 def test_spheres_touch_at_the_sum_of_their_radii(backend, dtype):
     x, h = spheres(dtype)
     given = {"radius_rule": "sum", "backend": backend}

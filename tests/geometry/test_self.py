@@ -7,10 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
+from checked import slow
 
 import jfrnn
 
-SLOW = pytest.mark.slow
 N, CAPACITY = 48, 64
 BOXES = {
     "open": None,
@@ -75,7 +75,7 @@ def each_kind():
         if (who, kind, backend, dtype) in OFTEN:
             yield pytest.param(who, kind, backend, dtype, OFTEN[who, kind, backend, dtype], id=name)
         parts = ALL - {"half"} if who in ("gather", "scatter") else ALL
-        yield pytest.param(who, kind, backend, dtype, parts, id=f"{name}-all", marks=SLOW)
+        yield slow(who, kind, backend, dtype, parts, id=f"{name}-all")
 
 
 def one(r, i, j):
@@ -130,7 +130,7 @@ def test_everyone_is_its_own_neighbor(who, kind, backend, dtype, parts):
         assert pairs_and_shifts(half.idx, *geometry) == mirrored
 
 
-@pytest.mark.parametrize(("who", "flat"), [("gather", False), *(pytest.param(*k, marks=SLOW) for k in product(WHO, (False, True)))])
+@pytest.mark.parametrize(("who", "flat"), [("gather", False), *(slow(*k) for k in product(WHO, (False, True)))])
 def test_a_list_with_a_skin_keeps_them(who, flat):
     x, cutoff, more = scene(who, np.float32)
     given = {"include_self": True, "skin": 0.05, **more}

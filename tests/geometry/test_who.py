@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
+from checked import slow, slowly
 from test_box import image_pairs
 
 import jfrnn
@@ -104,7 +105,7 @@ def test_options(who, backend):
     assert pairs_found(nbrs, x, queries=queries) == expected_pairs(who, x, species, pairs, None, queries=queries)
 
 
-@pytest.mark.parametrize("backend", ["warp", pytest.param("jax", marks=SLOW)])
+@pytest.mark.parametrize("backend", ["warp", slow("jax")])
 def test_a_box_per_system(backend):
     x, _, pairs = scene(np.float32, 3)
     box, batch = np.stack([np.ones(3), np.full(3, 1.25)]), np.arange(N) % 2
@@ -140,15 +141,9 @@ def heavy(r, i, j):
 
 
 SUMMED = [("exclude", "warp", "open", square)]
-SUMMED += [pytest.param("table, exclude", "warp", box, square, marks=SLOW) for box in ("open", "images")]
-SUMMED += [
-    pytest.param("exclude", "warp", "images", square, marks=SLOW),
-    pytest.param("exclude", "warp", "open", heavy, marks=SLOW),
-]
-SUMMED += [
-    pytest.param(*given, square, marks=SLOW)
-    for given in product(("exclude", "table, exclude"), ("jax", "brute"), ("open", "images"))
-]
+SUMMED += [slow("table, exclude", "warp", box, square) for box in ("open", "images")]
+SUMMED += [slow("exclude", "warp", "images", square), slow("exclude", "warp", "open", heavy)]
+SUMMED += [slow(*given, square) for given in product(("exclude", "table, exclude"), ("jax", "brute"), ("open", "images"))]
 
 
 @pytest.mark.parametrize(("who", "backend", "box", "fn"), SUMMED)
@@ -168,7 +163,7 @@ def test_sums_and_their_gradients(who, backend, box, fn):
     np.testing.assert_allclose(slopes, expected[1] + expected[2], atol=1e-4)
 
 
-@pytest.mark.parametrize("backend", ["warp", pytest.param("brute", marks=SLOW)])
+@pytest.mark.parametrize("backend", ["warp", slow("brute")])
 def test_sums_for_queries(backend):
     """A derivative by the positions sums over the rows of the particles, which exclude the queries that exclude them."""
     x, _, pairs = scene(np.float32, 3)
@@ -196,10 +191,7 @@ def test_largest_summands(who, backend):
     np.testing.assert_allclose(largest, expected, rtol=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("backend", "box"),
-    [("warp", "open"), *(pytest.param(*given, marks=SLOW) for given in (("warp", "images"), ("warp", "skewed"), ("jax", "open")))],
-)
+@pytest.mark.parametrize(("backend", "box"), [("warp", "open"), *slowly(("warp", "images"), ("warp", "skewed"), ("jax", "open"))])
 def test_kept_lists(backend, box):
     """A list keeps who pairs with whom over updates, and its geometry and sums decide by species; cutoffs may change."""
     x, species, pairs = scene(np.float32, 3)
@@ -354,7 +346,7 @@ def each_image_case():
             name = f"{lattice}-{kind}-{backend}-{dtype.__name__}"
             if (lattice, kind, backend) in IMAGES_OFTEN and dtype == np.float32:
                 yield pytest.param(lattice, kind, backend, dtype, False, id=name)
-            yield pytest.param(lattice, kind, backend, dtype, True, id=f"{name}-summed", marks=SLOW)
+            yield slow(lattice, kind, backend, dtype, True, id=f"{name}-summed")
 
 
 @pytest.mark.parametrize(("lattice", "kind", "backend", "dtype", "summed"), list(each_image_case()))
@@ -410,7 +402,7 @@ def test_excluded_images(lattice, kind, backend, dtype, summed):
     np.testing.assert_array_equal(sums, np.bincount([i for i, *_ in expected], minlength=len(nbrs.idx)))
 
 
-@pytest.mark.parametrize("apart", [pytest.param(False, marks=SLOW), True])
+@pytest.mark.parametrize("apart", [slow(False), True])
 def test_derivatives_leave_excluded_images_out(apart):
     """A square of sums, whose derivative runs over the pairs the other way round, too; of queries, these are other rows."""
     rng, lengths = np.random.default_rng(7), np.array([0.8, 1.1, 0.9])

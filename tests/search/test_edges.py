@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import reference
 import test_reverse as lists
+from checked import slow, sparing
 
 import jfrnn
 
-SLOW = pytest.mark.slow
 OFTEN = [("full", "open"), ("self", "images"), ("half", "images"), ("gather", "nearest"), ("queries", "open")]
 EACH = list(product(lists.KINDS, lists.BOXES))
 
@@ -28,7 +28,7 @@ def oracle(kind, box, x, q=None):
     return reference.reference_images(x, cutoff, queries=q, **cell, **given)
 
 
-@pytest.mark.parametrize(("kind", "box"), [pytest.param(*each, marks=[SLOW] * (each not in OFTEN)) for each in EACH])
+@pytest.mark.parametrize(("kind", "box"), sparing(EACH, OFTEN))
 def test_edges_are_the_pairs(kind, box):
     nbrs, x, q = lists.make(kind, "warp", box)
     (m, n), total = (nbrs.idx.shape[0], len(x)), int(np.asarray(nbrs.count).sum()) + 9
@@ -54,9 +54,7 @@ def test_edges_are_the_pairs(kind, box):
 
 
 DERIVED = [("full", "images", True), ("half", "images", True), ("queries", "open", True)]
-DERIVED += [
-    pytest.param(*each, marks=SLOW) for each in (("full", "images", False), ("half", "open", False), ("queries", "open", False))
-]
+DERIVED += [slow(*each) for each in (("full", "images", False), ("half", "open", False), ("queries", "open", False))]
 
 
 @pytest.mark.parametrize(("kind", "box", "reverse"), DERIVED)

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from checked import slow
 from test_kept import by_arrays
 
 import jfrnn
@@ -75,7 +76,7 @@ def each_list(kinds):
         yield pytest.param(kind, box, "warp", marks=[SLOW] * ((kind, box) not in SOME))
 
 
-BY_ARRAYS = [("half", "open", "brute"), pytest.param("queries", "images", "brute", marks=SLOW)]
+BY_ARRAYS = [("half", "open", "brute"), slow("queries", "images", "brute")]
 
 
 @pytest.mark.parametrize(("kind", "box", "backend"), [*each_list(KINDS), *BY_ARRAYS])
@@ -118,8 +119,8 @@ def cubes_of(pairs, x, sides=1.0):
 
 
 DERIVED = [("full", "images", False), ("half", "nearest", True), ("queries", "open", False)]
-DERIVED += [pytest.param(*each, marks=SLOW) for each in (("full", "open", True), ("half", "images", False))]
-DERIVED += [pytest.param(*each, marks=SLOW) for each in (("queries", "images", True), ("gather", "open", False))]
+DERIVED += [slow(*each) for each in (("full", "open", True), ("half", "images", False))]
+DERIVED += [slow(*each) for each in (("queries", "images", True), ("gather", "open", False))]
 
 
 @pytest.mark.parametrize(("kind", "box", "reverse"), DERIVED)
@@ -205,7 +206,7 @@ def test_derivatives_of_distances(kind):
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-11, atol=1e-11), derivatives, expected)
 
 
-@pytest.mark.parametrize(("kind", "reverse"), [("full", False), ("half", True), pytest.param("queries", False, marks=SLOW)])
+@pytest.mark.parametrize(("kind", "reverse"), [("full", False), ("half", True), slow("queries", False)])
 def test_derivatives_do_not_scatter(kind, reverse):
     def both(nbrs, x, q):
         f = jax.grad(lambda x: jnp.sum(by_arrays(nbrs).distances(x, queries=q)[0] ** 3))

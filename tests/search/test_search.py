@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import reference
 import soon
+from checked import slow, slowly
 
 import jfrnn
 
@@ -21,7 +22,7 @@ def random_points(n, dim, dtype, seed=0):
 
 
 SLOW = pytest.mark.slow
-BRUTE = pytest.param("brute", marks=SLOW)  # its filters and rows are those of "jax", and it compiles as slowly
+BRUTE = slow("brute")  # its filters and rows are those of "jax", and it compiles as slowly
 OPTIONS = [
     {},
     {"half": True},
@@ -56,7 +57,7 @@ def test_options(options, backend, dtype, dim):
         np.testing.assert_array_equal(jfrnn.count(points, cutoff, backend=backend, **options), nbrs.count)
 
 
-@pytest.mark.parametrize("backend", [pytest.param("jax", marks=SLOW), BRUTE, "warp", "hashgrid"])
+@pytest.mark.parametrize("backend", [slow("jax"), BRUTE, "warp", "hashgrid"])
 @pytest.mark.parametrize(("m", "dtype", "dim"), [(1, np.float32, 2), (7, np.float64, 3), (300, np.float32, 3)])
 def test_queries(m, backend, dtype, dim):
     points, queries = random_points(150, dim, dtype), 2 * random_points(m, dim, dtype, seed=1) - dtype(0.5)
@@ -65,7 +66,7 @@ def test_queries(m, backend, dtype, dim):
     np.testing.assert_array_equal(jfrnn.count(points, 0.2, queries=queries, backend=backend), nbrs.count)
 
 
-@pytest.mark.parametrize("backend", [pytest.param("jax", marks=pytest.mark.slow), "warp"])
+@pytest.mark.parametrize("backend", [slow("jax"), "warp"])
 def test_rows_longer_than_one_group_of_slots(backend):
     points = random_points(500, 3, np.float32)
     nbrs = jfrnn.search(points, 0.8, capacity=500, backend=backend)
@@ -86,7 +87,7 @@ def test_order_of_the_input_does_not_matter(dim):
     assert set(zip(shuffled[i].tolist(), shuffled[j].tolist(), strict=True)) == reference.reference_pairs(points, 0.15)
 
 
-@pytest.mark.parametrize("backend", [pytest.param("jax", marks=SLOW), BRUTE, "warp", "hashgrid"])
+@pytest.mark.parametrize("backend", [slow("jax"), BRUTE, "warp", "hashgrid"])
 def test_same_input_gives_the_same_bits(backend):
     points = random_points(3000, 3, np.float32)
     first, second = (jfrnn.search(points, 0.1, capacity=32, backend=backend) for _ in range(2))
@@ -117,8 +118,8 @@ def test_slack_multiplies_the_longest_row(slack, capacity):
     [
         *((capacity, backend) for capacity in (1, 3, 200) for backend in ("warp", "hashgrid")),
         (3, "jax"),
-        *(pytest.param(capacity, "jax", marks=SLOW) for capacity in (1, 200)),
-        *(pytest.param(capacity, "brute", marks=SLOW) for capacity in (1, 3, 200)),
+        *(slow(capacity, "jax") for capacity in (1, 200)),
+        *(slow(capacity, "brute") for capacity in (1, 3, 200)),
     ],
 )
 def test_overflow_sets_the_bit_and_keeps_true_counts(capacity, backend):
@@ -161,8 +162,8 @@ def test_one_neighbor_too_many_sets_the_bit(backend):
     [
         *((backend, *kind) for backend in ("warp", "hashgrid") for kind in [(np.float32, 3), (np.float64, 2)]),
         ("jax", np.float32, 3),
-        pytest.param("jax", np.float64, 2, marks=SLOW),
-        pytest.param("brute", np.float32, 3, marks=SLOW),
+        slow("jax", np.float64, 2),
+        slow("brute", np.float32, 3),
     ],
 )
 def test_non_finite_positions_set_a_bit_and_spare_the_others(value, backend, dtype, dim):
@@ -236,7 +237,7 @@ def test_one_program_serves_every_cutoff(backend):
     assert find_fields.cache_size() == before
 
 
-@pytest.mark.parametrize("backend", [pytest.param("jax", marks=SLOW), "warp"])
+@pytest.mark.parametrize("backend", [slow("jax"), "warp"])
 def test_closed_over_positions_are_counted_while_tracing(backend):
     points = random_points(50, 2, np.float32)
     nbrs = jax.jit(lambda: jfrnn.search(points, 0.2, backend=backend))()
@@ -255,7 +256,7 @@ def test_vmap_equals_a_loop(backend):
             np.testing.assert_array_equal(counts[k], one.count)
 
 
-@pytest.mark.parametrize("backend", [pytest.param("jax", marks=SLOW), "warp"])
+@pytest.mark.parametrize("backend", [slow("jax"), "warp"])
 def test_scan_and_cond(backend):
     start = random_points(60, 2, np.float32)
 
@@ -281,7 +282,7 @@ OTHER_SIZES = [(20_000, 64, np.float32, 2), (20_000, 20_000, np.float64, 2), (4_
 OTHER_SIZES += [(n, None, dtype, dim) for n, _, dtype, dim in [*SIZES, *OTHER_SIZES]]  # which count
 
 
-@pytest.mark.parametrize(("n", "capacity", "dtype", "dim"), [*SIZES, *(pytest.param(*size, marks=SLOW) for size in OTHER_SIZES)])
+@pytest.mark.parametrize(("n", "capacity", "dtype", "dim"), [*SIZES, *slowly(*OTHER_SIZES)])
 def test_memory_of_scratch_stays_within_the_stated_bound(n, capacity, dtype, dim):
     x = jax.ShapeDtypeStruct((n, dim), dtype)
     call = functools.partial(jfrnn.search, capacity=capacity) if capacity else jfrnn.count
@@ -290,7 +291,7 @@ def test_memory_of_scratch_stays_within_the_stated_bound(n, capacity, dtype, dim
     assert memory.temp_size_in_bytes <= candidates + (100 if dtype == np.float32 else 125) * n
 
 
-@pytest.mark.parametrize("backend", [pytest.param("jax", marks=SLOW), "warp"])
+@pytest.mark.parametrize("backend", [slow("jax"), "warp"])
 def test_memory_does_not_know_the_box(backend):
     programs = [
         jax.jit(lambda x, r=r: jfrnn.search(x, r, capacity=8, backend=backend))
@@ -372,7 +373,7 @@ def test_float64_without_x64_is_refused():
         jfrnn.search(X.astype(np.float64), 1.0)
 
 
-@pytest.mark.parametrize(("backend", "dim"), [("warp", 2), ("warp", 3), ("jax", 3), pytest.param("jax", 2, marks=SLOW)])
+@pytest.mark.parametrize(("backend", "dim"), [("warp", 2), ("warp", 3), ("jax", 3), slow("jax", 2)])
 def test_float32_works_without_x64(dim, backend):
     points = random_points(200, dim, np.float32)
     points[:50] = np.round(points[:50] * 16) / 16  # ties

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
+from checked import slow, slowly
 
 import jfrnn
 from jfrnn._engine.rows import add_up
@@ -59,9 +60,9 @@ def assert_right(nbrs, x, expected, queries=None):
     ("backend", "box"),
     [
         ("warp", "images"),
-        *(pytest.param("brute", box, marks=SLOW) for box in ("open", "images")),
-        *(pytest.param("warp", box, marks=SLOW) for box in ("open", "nearest")),
-        *(pytest.param("jax", box, marks=SLOW) for box in LENGTHS),
+        *(slow("brute", box) for box in ("open", "images")),
+        *(slow("warp", box) for box in ("open", "nearest")),
+        *(slow("jax", box) for box in LENGTHS),
     ],
 )
 def test_edges_are_those_of_the_oracle(backend, box):
@@ -99,7 +100,7 @@ def test_systems(backend):
     assert_right(nbrs, x, {p for p in oracle(x, "images") if systems[p[0]] == systems[p[1]]})
 
 
-@pytest.mark.parametrize("backend", ["warp", pytest.param("brute", marks=SLOW)])
+@pytest.mark.parametrize("backend", ["warp", slow("brute")])
 def test_too_small_a_total_is_never_silent(backend):
     x = points()
     whole = jfrnn.search_edges(x, CUTOFF, backend=backend)
@@ -142,7 +143,7 @@ def test_a_chunk_is_replayed_with_a_larger_total():
     assert edges_as_set(grown.edges(y)) == oracle(np.asarray(y), "open")
 
 
-@pytest.mark.parametrize("half", [True, pytest.param(False, marks=SLOW)])
+@pytest.mark.parametrize("half", [True, slow(False)])
 def test_sums_are_those_of_numpy(half):
     """Over the pairs of a flat list at positions of now and at a shorter cutoff, with derivatives in positions, values and box."""
     x, lengths = points(30, "images", dtype=np.float64), np.array(LENGTHS["images"])
@@ -257,9 +258,7 @@ def test_where_rows_begin_never_wraps():
     np.testing.assert_array_equal(jax.jit(add_up)(jnp.asarray(counts[:3])), exact[:4])
 
 
-@pytest.mark.parametrize(
-    ("backend", "include_self"), [("warp", False), *(pytest.param(*each, marks=SLOW) for each in (("warp", True), ("jax", False)))]
-)
+@pytest.mark.parametrize(("backend", "include_self"), [("warp", False), *slowly(("warp", True), ("jax", False))])
 def test_own_images_in_half_lists(backend, include_self):
     """They are listed once, and so counted, with and without a program, where both ends of a pair are one particle."""
     x, lengths = points(5), np.array([0.25, 0.25, 0.25])

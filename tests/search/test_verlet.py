@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
+from checked import slow, slowly
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -48,7 +49,7 @@ def test_radius_of_the_list_is_the_exact_sum_rounded_up(cutoff, skin):
 WARP = [("warp", dtype, dim) for dtype in (np.float32, np.float64) for dim in (2, 3)]
 EACH = [WARP[1], WARP[2], ("hashgrid", np.float32, 2), ("hashgrid", np.float64, 3), ("jax", np.float32, 3)]
 MORE = [WARP[0], WARP[3], ("hashgrid", np.float32, 3), ("hashgrid", np.float64, 2), ("brute", np.float32, 2)]
-EACH += [pytest.param(*more, marks=pytest.mark.slow) for more in MORE]
+EACH += [slow(*more) for more in MORE]
 
 
 @pytest.mark.parametrize(("backend", "dtype", "dim"), EACH)
@@ -62,7 +63,7 @@ def test_a_list_with_a_skin_holds_the_wider_pairs_and_masks_to_the_cutoff(backen
 
 
 @pytest.mark.parametrize(("ulps", "rebuilds"), [(-40, 0), (0, 1), (1, 1)])
-@pytest.mark.parametrize(("backend", "dtype", "dim"), [*WARP, pytest.param("jax", np.float32, 3, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(("backend", "dtype", "dim"), [*WARP, slow("jax", np.float32, 3)])
 def test_half_the_skin_is_as_far_as_a_point_may_go(ulps, rebuilds, backend, dtype, dim):
     """Two points come closer by almost the whole skin: their pair must be in the old list, or the list be made anew."""
     half = np.float64(dtype(SKIN)) / 2
@@ -78,7 +79,7 @@ def test_half_the_skin_is_as_far_as_a_point_may_go(ulps, rebuilds, backend, dtyp
     assert masked_pairs(after, jnp.asarray(moved)) == reference.reference_pairs(moved, CUTOFF)
 
 
-@pytest.mark.parametrize("backend", ["warp", pytest.param("jax", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("backend", ["warp", slow("jax")])
 @settings(max_examples=6, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.3, 0.499, 0.5, 0.51, 2.0]), st.integers(-3, 3))
 def test_adversarial_motion_misses_no_pair(backend, seed, part, ulps):
@@ -114,10 +115,7 @@ def test_teleports_and_points_that_vanish(dtype, dim):
         assert masked_pairs(nbrs, jnp.asarray(x)) == reference.reference_pairs(x, CUTOFF), name
 
 
-@pytest.mark.parametrize(
-    ("dtype", "dim"),
-    [(np.float32, 3), (np.float64, 2), *(pytest.param(*x, marks=pytest.mark.slow) for x in ((np.float32, 2), (np.float64, 3)))],
-)
+@pytest.mark.parametrize(("dtype", "dim"), [(np.float32, 3), (np.float64, 2), *slowly((np.float32, 2), (np.float64, 3))])
 def test_queries_move_too(dtype, dim):
     x, q = np.asarray(points(60, dim, dtype)), np.asarray(points(9, dim, dtype, 1))
     nbrs = jfrnn.search(x, CUTOFF, queries=q, skin=SKIN, capacity=64)
@@ -134,7 +132,7 @@ def test_queries_move_too(dtype, dim):
     [
         *product([{}, {"half": True}, {"include_self": True}, {"closed": True}], ["warp", "hashgrid"]),
         ({"half": True, "closed": True}, "jax"),
-        pytest.param({"half": True, "closed": True}, "brute", marks=pytest.mark.slow),
+        slow({"half": True, "closed": True}, "brute"),
     ],
     ids=str,
 )
@@ -151,7 +149,7 @@ def test_without_a_skin_update_is_a_search(options, backend):
         np.testing.assert_array_equal(one, other)
 
 
-@pytest.mark.parametrize("backend", [pytest.param("jax", marks=pytest.mark.slow), "warp"])
+@pytest.mark.parametrize("backend", [slow("jax"), "warp"])
 def test_in_a_scan_it_rebuilds_as_often_as_needed_and_traces_once(backend):
     x = points(80, 3, np.float32)
     nbrs = jfrnn.search(x, CUTOFF, skin=SKIN, capacity=80, backend=backend)
@@ -226,11 +224,7 @@ def test_a_chunk_is_replayed_until_its_list_was_large_enough():
 
 
 @pytest.mark.parametrize(
-    ("backend", "dim"),
-    [
-        *(("warp", 3), ("hashgrid", 2)),
-        *(pytest.param(*x, marks=pytest.mark.slow) for x in (("warp", 2), ("hashgrid", 3), ("jax", 3), ("brute", 2))),
-    ],
+    ("backend", "dim"), [*(("warp", 3), ("hashgrid", 2)), *slowly(("warp", 2), ("hashgrid", 3), ("jax", 3), ("brute", 2))]
 )
 def test_inactive_particles_have_no_neighbors_and_come_and_go(backend, dim):
     x = np.asarray(points(60, dim, np.float32)).copy()

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
+from checked import slow
 
 import jfrnn
 
@@ -40,8 +41,8 @@ def rows_of(box):
     return np.diag(rows) if rows.ndim == 1 else rows
 
 
-@pytest.mark.parametrize("dtype", [np.float32, pytest.param(np.float64, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("backend", ["warp", pytest.param("jax", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("dtype", [np.float32, slow(np.float64)])
+@pytest.mark.parametrize("backend", ["warp", slow("jax")])
 def test_positions_that_are_wrapped_in_every_step_cost_no_lists(backend, dtype):
     lengths, cutoff, skin = np.array([1.0, 1.3, 0.9]), 0.2, 0.05
     box, rng = jfrnn.Box(lengths), np.random.default_rng(0)
@@ -82,9 +83,7 @@ UPDATED = ("long, own images",)  # in lists of other kinds, tests below ask whet
 ALL = [(dtype, kind, asked) for dtype in (np.float32, np.float64) for kind in KINDS for asked in ("own", "half", "queries")]
 
 
-@pytest.mark.parametrize(
-    ("dtype", "kind", "asked"), [*EACH, *(pytest.param(*x, marks=pytest.mark.slow) for x in ALL if x not in EACH)]
-)
+@pytest.mark.parametrize(("dtype", "kind", "asked"), [*EACH, *(slow(*x) for x in ALL if x not in EACH)])
 def test_images_of_a_kept_list_are_those_of_the_moved_particles(dtype, kind, asked):
     box, cutoff = KINDS[kind]
     rng, skin, rows = np.random.default_rng(1), 0.1, rows_of(box)
@@ -225,9 +224,9 @@ def by_grow(chunk, state, nbrs):
 @pytest.mark.parametrize(
     ("lengths", "cutoff", "skin", "ratio", "run"),
     [
-        pytest.param([25.75, 25.75, 25.75], 12.0, 0.5, 0.96, by_run_chunk, marks=pytest.mark.slow),
+        slow([25.75, 25.75, 25.75], 12.0, 0.5, 0.96, by_run_chunk),
         ([25.75, 25.75, 25.75], 12.0, 0.5, 0.96, by_grow),
-        pytest.param([10.0, 9.0, 11.0], 2.5, 0.0, 0.1, by_the_loop_of_the_readme, marks=pytest.mark.slow),
+        slow([10.0, 9.0, 11.0], 2.5, 0.0, 0.1, by_the_loop_of_the_readme),
     ],
     ids=["run_chunk", "grow", "loop"],
 )

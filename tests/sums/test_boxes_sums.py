@@ -5,6 +5,7 @@ import functools
 import jax
 import numpy as np
 import pytest
+from checked import slow
 from marked import assert_marks, marks
 from test_boxes import CAPACITY, box_of, expected_images
 from test_kept_cuda import compiles, term_of
@@ -49,7 +50,7 @@ def assert_case(name, dtype, dim, listed):
 @pytest.mark.parametrize(
     ("name", "listed"),
     [
-        (name, listed) if (name, listed) in (("mixed", False), ("far", True)) else pytest.param(name, listed, marks=SLOW)
+        (name, listed) if (name, listed) in (("mixed", False), ("far", True)) else slow(name, listed)
         for name in CRYSTAL_CASES
         for listed in (False, True)
     ],

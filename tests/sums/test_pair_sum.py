@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import reference
 from by_numpy import add_up, in_order
+from checked import slow, slowly
 from marked import assert_compensated, assert_marks, cancelling
 from marked import marks as marks_of_floats
 
@@ -20,7 +21,6 @@ from jfrnn._sums import summation as _summation
 from jfrnn.cases.batches import BATCH_CASES
 from jfrnn.cases.hard import HARD_CASES
 
-SLOW = pytest.mark.slow
 LENGTH = 704  # so that cases share compiled programs
 
 
@@ -63,14 +63,14 @@ LONG = {"mixed_exponents", "clumps_near_max"}  # for array programs: the one tak
 KINDS = [
     pytest.param("warp", np.float32, 3, HARD, id="warp-f32-3d"),
     pytest.param("warp", np.float64, 2, HARD, id="warp-f64-2d"),
-    pytest.param("warp", np.float32, 2, HARD, id="warp-f32-2d", marks=SLOW),
-    pytest.param("warp", np.float64, 3, HARD, id="warp-f64-3d", marks=SLOW),
+    slow("warp", np.float32, 2, HARD, id="warp-f32-2d"),
+    slow("warp", np.float64, 3, HARD, id="warp-f64-3d"),
     pytest.param("jax", np.float32, 3, [name for name in HARD if name not in LONG], id="jax-f32-3d"),
-    pytest.param("jax", np.float32, 3, sorted(LONG), id="jax-f32-3d-long", marks=SLOW),
-    pytest.param("brute", np.float64, 2, HARD, id="brute-f64-2d", marks=SLOW),
-    pytest.param("jax", np.float64, 2, HARD, id="jax-f64-2d", marks=SLOW),
-    pytest.param("jax", np.float64, 3, HARD, id="jax-f64-3d", marks=SLOW),
-    pytest.param("brute", np.float32, 3, HARD, id="brute-f32-3d", marks=SLOW),
+    slow("jax", np.float32, 3, sorted(LONG), id="jax-f32-3d-long"),
+    slow("brute", np.float64, 2, HARD, id="brute-f64-2d"),
+    slow("jax", np.float64, 2, HARD, id="jax-f64-2d"),
+    slow("jax", np.float64, 3, HARD, id="jax-f64-3d"),
+    slow("brute", np.float32, 3, HARD, id="brute-f32-3d"),
 ]
 
 
@@ -82,7 +82,7 @@ def test_hard_cases(backend, dtype, dim, names):
         assert_marks(sums, reference.reference_pairs(given.positions, given.cutoff), given.positions)
 
 
-@pytest.mark.parametrize("backend", ["warp", "brute", pytest.param("jax", marks=SLOW)])
+@pytest.mark.parametrize("backend", ["warp", "brute", slow("jax")])
 def test_options(backend):
     """Several systems, of particles that are active or not, closed, with themselves; each where it decides something."""
     given, options = BATCH_CASES["ties"].build(np.float32, 3), {"closed": True, "include_self": True}
@@ -96,7 +96,7 @@ def test_options(backend):
     assert_marks(sums, together, given.positions)
 
 
-@pytest.mark.parametrize("backend", ["warp", pytest.param("brute", marks=SLOW), pytest.param("jax", marks=SLOW)])
+@pytest.mark.parametrize("backend", ["warp", slow("brute"), slow("jax")])
 def test_queries_of_active_particles(backend):
     given = HARD_CASES["queries_coincident"].build(np.float32, 3)
     active = np.arange(LENGTH) % 3 > 0
@@ -130,7 +130,7 @@ def test_empty(n, m):
 N = 60
 CUTOFF = 0.5
 ENGINES = [("list", True), ("brute", False)]  # on the latter, second derivatives are made of the same parts, and compile slowly
-ENGINES += [pytest.param(*engine, marks=SLOW) for engine in (("jax", False), ("brute", True), ("jax", True))]
+ENGINES += [slow(*engine) for engine in (("jax", False), ("brute", True), ("jax", True))]
 
 
 def scene(seed, dim=2):
@@ -240,7 +240,7 @@ def assert_same(found, expected, tolerance=1e-12):
         assert float(np.abs(wanted).max()) > 0
 
 
-@pytest.mark.parametrize("backend", ["list", "warp", pytest.param("brute", marks=SLOW), pytest.param("jax", marks=SLOW)])
+@pytest.mark.parametrize("backend", ["list", "warp", slow("brute"), slow("jax")])
 def test_derivatives(backend):
     """Of coincident points, at ties, in empty rows; then of random points, where finite differences exist as well."""
     nbrs = [jfrnn.search(scene(seed)[0], CUTOFF, capacity=48, backend="warp") for seed in (0, 1)]
@@ -290,8 +290,8 @@ def test_third_derivatives():
     assert_same(third(x, nbrs), add_up(terms, j, N) - add_up(terms, i, N))
 
 
-@pytest.mark.parametrize("rule", ["scatter", pytest.param("gather", marks=SLOW), pytest.param("mean", marks=SLOW)])
-@pytest.mark.parametrize(("backend", "second"), [pytest.param(*ENGINES[0], marks=SLOW), ENGINES[1]])
+@pytest.mark.parametrize("rule", ["scatter", slow("gather"), slow("mean")])
+@pytest.mark.parametrize(("backend", "second"), [slow(*ENGINES[0]), ENGINES[1]])
 def test_derivatives_with_queries_and_radii(backend, second, rule):
     """The reversed pairs are those of the other rule; values of queries and of positions are apart."""
     (x, m), q = scene(1), jnp.asarray(np.asarray(scene(2)[0])[:23])
@@ -321,8 +321,8 @@ PERIODIC = (True, True, False)
 @pytest.mark.parametrize(
     ("backend", "second"),
     [
-        *(pytest.param(*e, marks=SLOW) for e in (("half", False), ("list", True), ("half", True), ("flat", True))),
-        *(pytest.param(*e, marks=SLOW) for e in (("flat half", True), ("brute", False), ("jax", True), ("warp", True))),
+        *slowly(("half", False), ("list", True), ("half", True), ("flat", True)),
+        *slowly(("flat half", True), ("brute", False), ("jax", True), ("warp", True)),
         ("warp", False),
     ],
 )
@@ -351,7 +351,7 @@ def test_derivatives_in_a_box(backend, second):
     assert float(ahead - behind) / 2e-7 == pytest.approx(slope, rel=1e-5)
 
 
-@pytest.mark.parametrize("backend", ["jax", "list", pytest.param("brute", marks=SLOW)])
+@pytest.mark.parametrize("backend", ["jax", "list", slow("brute")])
 def test_many_blocks(backend, monkeypatch):
     """Blocks of which the last reaches back, in sums over rows and over all pairs."""
     monkeypatch.setattr(_tuning, "CPU", _tuning.CPU._replace(words=64 * 25, few_pairs=0, plain_pairs=0))
@@ -384,8 +384,7 @@ def partly_active():
 
 
 @pytest.mark.parametrize(
-    ("backend", "second"),
-    [("list", False), ("warp", False), *(pytest.param(*k, marks=SLOW) for k in (ENGINES[0], ("brute", False), ("jax", False)))],
+    ("backend", "second"), [("list", False), ("warp", False), *slowly(ENGINES[0], ("brute", False), ("jax", False))]
 )
 def test_what_is_no_pair_poisons_nothing(backend, second):
     """fn is NaN or infinite where there is no pair, and so are values and positions of inactive particles."""
@@ -434,11 +433,7 @@ def imposed(sign, pairs):
 
 @pytest.mark.parametrize(
     ("backend", "symmetry"),
-    [
-        ("half", "antisymmetric"),
-        *(pytest.param(b, "symmetric", marks=SLOW) for b in ("list", "half", "jax", "warp")),
-        pytest.param("brute", "antisymmetric", marks=SLOW),
-    ],
+    [("half", "antisymmetric"), *(slow(b, "symmetric") for b in ("list", "half", "jax", "warp")), slow("brute", "antisymmetric")],
 )
 def test_symmetry(backend, symmetry):
     x, m = scene(1, dim=3)
@@ -466,11 +461,7 @@ def test_lists_give_whole_sums(options):
 
 
 @pytest.mark.parametrize(
-    ("backend", "reduce"),
-    [
-        ("warp", "min"),
-        *(pytest.param(*kind, marks=SLOW) for kind in (("list", "max"), ("list", "min"), ("brute", "min"), ("jax", "max"))),
-    ],
+    ("backend", "reduce"), [("warp", "min"), *slowly(("list", "max"), ("list", "min"), ("brute", "min"), ("jax", "max"))]
 )
 def test_extremes(backend, reduce):
     """Of own images too; rows without neighbors; the derivative is that of the extreme pair."""
@@ -539,7 +530,7 @@ def test_of_equal_extremes_the_smallest_index_counts(backend):
     np.testing.assert_array_equal(rows[48:], [47, -np.inf])
 
 
-@pytest.mark.parametrize("backend", ["list", pytest.param("jax", marks=SLOW), pytest.param("brute", marks=SLOW)])
+@pytest.mark.parametrize("backend", ["list", slow("jax"), slow("brute")])
 def test_rounding(backend):
     """Sums of many terms against exact ones: the bound of the docstring, and with compensation a far smaller one."""
     values, x = cancelling(500), np.zeros((500, 2), np.float32)
@@ -596,7 +587,7 @@ def test_programs_are_used_again():
     assert _summation._compiled.cache_size() == size + 1
 
 
-@pytest.mark.parametrize("backend", ["list", pytest.param("brute", marks=SLOW), pytest.param("jax", marks=SLOW)])
+@pytest.mark.parametrize("backend", ["list", slow("brute"), slow("jax")])
 def test_vmap_and_scan(backend):
     """Both over a gradient; some operands have no batch."""
     x, m = scene(1)
@@ -640,7 +631,7 @@ def test_derivatives_of_vmap():
     assert_same(gradient(x, scales), (first + second, np.array([one, two])))
 
 
-@pytest.mark.parametrize(("backend", "dim", "most", "each"), [("warp", 3, 1e6, 250), pytest.param("jax", 2, 64e6, 200, marks=SLOW)])
+@pytest.mark.parametrize(("backend", "dim", "most", "each"), [("warp", 3, 1e6, 250), slow("jax", 2, 64e6, 200)])
 def test_memory_does_not_grow_with_pairs(backend, dim, most, each):
     """A million particles: gradient included, less than their neighbors alone would take, were they listed."""
     n = 1_000_000
@@ -689,7 +680,7 @@ def sums_and_forces(x, m, nbrs, active, backend, reduce):
 
 
 @pytest.mark.parametrize("reduce", ["sum", "max"])
-@pytest.mark.parametrize("backend", ["warp", *(pytest.param(name, marks=SLOW) for name in ("list", "brute", "jax"))])
+@pytest.mark.parametrize("backend", ["warp", *(slow(name) for name in ("list", "brute", "jax"))])
 def test_a_particle_that_is_nowhere_has_no_sum(backend, reduce):
     """Nor has it a force; the others have what they have without it, and inactive particles have 0 as everywhere."""
     x, m = scene(2)
@@ -724,8 +715,8 @@ def test_a_query_that_is_nowhere_has_no_sum():
         np.testing.assert_array_equal(np.flatnonzero(np.isnan(sums)), [4])
 
 
-@pytest.mark.parametrize("queries", [False, pytest.param(True, marks=SLOW)])
-@pytest.mark.parametrize("backend", ["warp", pytest.param("jax", marks=SLOW)])
+@pytest.mark.parametrize("queries", [False, slow(True)])
+@pytest.mark.parametrize("backend", ["warp", slow("jax")])
 def test_what_has_no_sum_has_no_derivative_in_its_position(backend, queries):
     """Of two orders; in positions alone, and where queries are given, in theirs."""
     x, m = scene(2)
@@ -754,9 +745,7 @@ def test_what_has_no_sum_has_no_derivative_in_its_position(backend, queries):
     assert all(np.isfinite(np.delete(a, which, axis=0)).all() for a, which in zip((rows, *pulled, *again), nowhere, strict=True))
 
 
-@pytest.mark.parametrize(
-    ("half", "reduce"), [(False, "sum"), *(pytest.param(*kind, marks=SLOW) for kind in ((True, "sum"), (False, "max")))]
-)
+@pytest.mark.parametrize(("half", "reduce"), [(False, "sum"), *slowly((True, "sum"), (False, "max"))])
 def test_a_list_that_lacks_pairs_has_no_sums(half, reduce):
     """Outside jit, and where it is closed over, it raises; inside, no row looks like a sum, nor does a force."""
     x, m = scene(1)
@@ -842,7 +831,7 @@ def test_errors(error, match, call):
         call()
 
 
-@pytest.mark.parametrize("backend", ["warp", pytest.param("jax", marks=SLOW)])
+@pytest.mark.parametrize("backend", ["warp", slow("jax")])
 def test_a_list_with_a_shorter_cutoff(backend):
     """A list serves two cutoffs: its own pairs, and those of a shorter one, with derivatives."""
     x, short = jnp.asarray(np.random.default_rng(8).random((60, 3))), 0.2

@@ -10,20 +10,9 @@ import numpy as np
 import pytest
 import reference
 from by_numpy import add_up, in_order
+from checked import slow
 from marked import assert_compensated, cancelling
-from test_pair_sum import (
-    CUTOFF,
-    LENGTH,
-    SLOW,
-    N,
-    assert_same,
-    everything,
-    oracle,
-    oracle_sum,
-    scene,
-    stepped,
-    tangents_of,
-)
+from test_pair_sum import CUTOFF, LENGTH, N, assert_same, everything, oracle, oracle_sum, scene, stepped, tangents_of
 
 import jfrnn
 from jfrnn._sums import translate as _translate
@@ -51,7 +40,7 @@ def one(r, i, j):
     return 1.0
 
 
-@pytest.mark.parametrize("box", [pytest.param(None, marks=SLOW), jfrnn.Box([1.0] * 3)], ids=["open", "box"])
+@pytest.mark.parametrize("box", [slow(None), jfrnn.Box([1.0] * 3)], ids=["open", "box"])
 def test_integers_travel_whose_bits_are_no_usual_floats(box):
     """-0, numbers that are none and denormals, as floats: nothing may be computed with them on the way."""
     bits = np.array([0x80000000, 0x7F800001, 0xFF812345, 0x00000001, 0x7FC00000, 0x80000001], np.uint32).view(np.int32)
@@ -85,7 +74,7 @@ def heavy(r, i, j):
     return jnp.sin(j * jnp.linspace(0.01, 0.03, 8, dtype=j.dtype)).sum()
 
 
-@pytest.mark.parametrize("fn", [light, pytest.param(heavy, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("fn", [light, slow(heavy)])
 def test_extremes_among_more_candidates_than_fit(fn):
     """Of equal ones that of the smallest index; NaN is not hidden; rows without neighbors."""
     n = 3000
@@ -140,7 +129,7 @@ def of_all_kinds(scale, r, i, j):
     return {"turned": turned, "outer": jnp.outer(r, j["vector"]), "rest": [scale * heavy, jnp.maximum(r, 0)]}
 
 
-@pytest.mark.parametrize("dtype", [np.float32, pytest.param(np.float64, marks=SLOW)])
+@pytest.mark.parametrize("dtype", [np.float32, slow(np.float64)])
 def test_values_of_all_kinds(dtype):
     random = np.random.default_rng(1)
     x = jnp.asarray(random.random((400, 3)), dtype)

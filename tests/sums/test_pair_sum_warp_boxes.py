@@ -8,8 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
+from checked import slow
 from marked import assert_marks, marks
-from test_pair_sum import CUTOFF, SLOW, assert_same, everything, oracle, scene, smooth, smooth_slopes, tangents_of
+from test_pair_sum import CUTOFF, assert_same, everything, oracle, scene, smooth, smooth_slopes, tangents_of
 
 import jfrnn
 from jfrnn.cases.batches import BATCH_CASES
@@ -58,7 +59,7 @@ def marks_at_work(r, i, j):
     return marks(r, i, j) | {"more": jnp.exp(jnp.sin(r)).sum() + jnp.cos(i * j)}
 
 
-@pytest.mark.parametrize("fn", [marks, pytest.param(marks_at_work, marks=SLOW)])
+@pytest.mark.parametrize("fn", [marks, slow(marks_at_work)])
 def test_where_no_pair_crosses_the_box(fn):
     """Within a box pairs have no shift, and coordinates are those of the candidates; but not where particles lie outside.
 
@@ -86,7 +87,7 @@ def test_options():
     assert_case("crystal_integer", np.float32, 3, closed=True, include_self=True)
 
 
-@pytest.mark.parametrize("name", ["periodic", pytest.param("periodic_images", marks=SLOW)])
+@pytest.mark.parametrize("name", ["periodic", slow("periodic_images")])
 def test_batches(name):
     """In a box that is traced: its image is the nearest one, or how many are looked at is said."""
     given = BATCH_CASES[name].build(np.float64, 2)
@@ -107,7 +108,7 @@ def test_batches(name):
 # --- derivatives -------------------------------------------------------------------------------------------------------------
 
 
-@SLOW
+@pytest.mark.slow
 def test_derivatives_with_queries():
     """The reversed pairs have their own turns."""
     (x, m), q = scene(1), jnp.asarray(np.asarray(scene(2)[0])[:23] - np.array([3.0, 0.0]))

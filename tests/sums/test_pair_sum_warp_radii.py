@@ -8,8 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
+from checked import slow
 from marked import assert_compensated, assert_marks, cancelling, marks
-from test_pair_sum import SLOW, N, assert_same, everything, oracle, scene, smooth, smooth_slopes, tangents_of
+from test_pair_sum import N, assert_same, everything, oracle, scene, smooth, smooth_slopes, tangents_of
 from test_radii import LENGTH, radii_of
 
 import jfrnn
@@ -40,7 +41,7 @@ def assert_case(name, dtype, dim, rule, **options):
     return len(pairs)
 
 
-@pytest.mark.parametrize("rule", ["mean", *(pytest.param(rule, marks=SLOW) for rule in RULES if rule != "mean")])
+@pytest.mark.parametrize("rule", ["mean", *(slow(rule) for rule in RULES if rule != "mean")])
 @pytest.mark.parametrize("name", ["ties", "spread_100", "coincident"])
 def test_open_cases(name, rule):
     assert assert_case(name, np.float32, 3, rule)
@@ -76,7 +77,7 @@ def light(r, i, j):
     return j
 
 
-@pytest.mark.parametrize(("rule", "second"), [("scatter", False), *(pytest.param(rule, True, marks=SLOW) for rule in RULES)])
+@pytest.mark.parametrize(("rule", "second"), [("scatter", False), *(slow(rule, True) for rule in RULES)])
 def test_derivatives(rule, second):
     """In a box with several images of a pair, and turns of particles; the reversed pairs are those of another rule."""
     (x, m), fn, lengths = scene(1), functools.partial(smooth, 0.7), np.array([0.6, 1.5])

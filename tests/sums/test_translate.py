@@ -14,6 +14,7 @@ import sys
 import jax
 import numpy as np
 import pytest
+from checked import slow
 from jax import lax
 from jax import numpy as jnp
 from translated import Case, kernel_of, run
@@ -226,7 +227,7 @@ def test_key_is_the_same_in_every_process():
 # --- CUDA -------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("real", ["float32", pytest.param("float64", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("real", ["float32", slow("float64")])
 def test_cases_compile_for_cuda(real):
     load_warp()
     kernel = kernel_of([*ELEMENTWISE.values(), *INTEGERS.values(), *PAIRS.values()], real, "scalar", "cuda", cuda=True)

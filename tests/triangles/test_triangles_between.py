@@ -4,6 +4,7 @@ import jax
 import numpy as np
 import pytest
 import reference
+from checked import slowly
 
 import jfrnn
 
@@ -34,13 +35,7 @@ def faces_of(count, dim):
     return np.resize(np.arange(FACES * dim).reshape(FACES, dim), (count, dim))
 
 
-@pytest.mark.parametrize(
-    ("dim", "dtype"),
-    [
-        (3, np.float32),
-        *(pytest.param(*case, marks=pytest.mark.slow) for case in ((3, np.float64), (2, np.float32), (2, np.float64))),
-    ],
-)
+@pytest.mark.parametrize(("dim", "dtype"), [(3, np.float32), *slowly((3, np.float64), (2, np.float32), (2, np.float64))])
 def test_who_is_parted(dim, dtype):
     rng, faces = np.random.default_rng(2), faces_of(FACES, dim)
     between = jax.jit(lambda tri, x: tri.between(x, PAIRS))

@@ -9,6 +9,7 @@ import launched
 import numpy as np
 import pytest
 import reference
+from checked import slow
 
 import jfrnn
 from jfrnn._geometry.cutoffs import make_cutoff
@@ -22,7 +23,7 @@ from jfrnn.cases import meshes
 from jfrnn.cases.triangles import TRIANGLE_CASES, padded
 from jfrnn.kernels import _compile, winding
 
-KINDS = [pytest.param(np.float32, 3, id="f32-3d"), pytest.param(np.float64, 2, id="f64-2d", marks=pytest.mark.slow)]
+KINDS = [pytest.param(np.float32, 3, id="f32-3d"), slow(np.float64, 2, id="f64-2d")]
 PAIRS = 400
 
 
@@ -297,10 +298,8 @@ def expected_side(x, vertices, faces, name="one"):
     return np.array([number is not None and number >= least for number in numbers]), np.array([x is None for x in numbers])
 
 
-@pytest.mark.parametrize(
-    "backend", ["bvh", pytest.param("warp", marks=pytest.mark.slow), pytest.param("jax", marks=pytest.mark.slow)]
-)
-@pytest.mark.parametrize("dtype", [np.float64, pytest.param(np.float32, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("backend", ["bvh", slow("warp"), slow("jax")])
+@pytest.mark.parametrize("dtype", [np.float64, slow(np.float32)])
 @pytest.mark.parametrize(("dim", "name"), WALLS)
 def test_signs_are_those_of_the_union(dim, name, dtype, backend):
     vertices, faces = joined(*walls(dim)[name])
@@ -353,8 +352,8 @@ def test_rays_from_within_rounding_of_a_face(dtype):
     assert 50 < expected.sum() < 150
 
 
-@pytest.mark.parametrize("dim", [2, pytest.param(3, marks=pytest.mark.slow)])  # in 3D the next test does, with one wall
-@pytest.mark.parametrize("dtype", [np.float32, pytest.param(np.float64, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("dim", [2, slow(3)])  # in 3D the next test does, with one wall
+@pytest.mark.parametrize("dtype", [np.float32, slow(np.float64)])
 def test_rays_without_warp(dim, dtype):
     """Rays of arrays tell the sides that those of kernels do, or leave them open."""
     for name, parts in walls(dim).items():
@@ -391,8 +390,8 @@ def test_rays_through_a_tree_of_many_levels():
     assert len(set(expected)) == 2
 
 
-@pytest.mark.parametrize("dim", [pytest.param(2, marks=pytest.mark.slow), 3])
-@pytest.mark.parametrize("dtype", [np.float32, pytest.param(np.float64, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("dim", [slow(2), 3])
+@pytest.mark.parametrize("dtype", [np.float32, slow(np.float64)])
 def test_kernel_for_cuda(dim, dtype):
     """It compiles for a GPU, nothing contracted; its text for the CPU tells the sides, too."""
     double = dtype == np.float64

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from checked import slow
 from jax.extend.core import jaxprs_in_params
 
 import jfrnn
@@ -52,7 +53,7 @@ def on_triangles(rng, vertices, faces, n):
     return points + rng.normal(size=points.shape) * 10 ** rng.uniform(-9, -1, (n, 1)) * rng.integers(0, 2, (n, 1))
 
 
-@pytest.mark.parametrize("dtype", [np.float32, pytest.param(np.float64, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("dtype", [np.float32, slow(np.float64)])
 def test_a_flat_wall_of_many_triangles_is_one_contact(dtype):
     rng, (_, vertices, faces) = np.random.default_rng(0), plate_and_points()
     faces, n = rng.permutation(faces), 2000
@@ -114,9 +115,7 @@ def _nearest(points, corners):
     return nearest_of(points, corners).vectors
 
 
-@pytest.mark.parametrize(
-    "mesh", [pytest.param(meshes.cube(2.0, 4), id="3d"), pytest.param(meshes.circle(1.0, 64), id="2d", marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize("mesh", [pytest.param(meshes.cube(2.0, 4), id="3d"), slow(meshes.circle(1.0, 64), id="2d")])
 def test_contacts_are_those_of_the_description(mesh):
     rng, (vertices, faces) = np.random.default_rng(2), mesh
     vertices = vertices + rng.uniform(-0.03, 0.03, vertices.shape)  # edges of all angles, convex and concave

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import launched
 import numpy as np
 import pytest
+from checked import sparing
 
 import jfrnn
 from jfrnn._engine import auto as _auto
@@ -35,9 +36,7 @@ VARIANTS = list(product((2, 3), *[(False, True)] * 3))
 PAIRWISE = [VARIANTS[k] for k in (0, 7, 11, 13, 14)]  # of any two options, each pair of what they may be stands in one
 
 
-@pytest.mark.parametrize(
-    ("dim", "double", "lists", "tree"), [pytest.param(*v, marks=[pytest.mark.slow] * (v not in PAIRWISE)) for v in VARIANTS]
-)
+@pytest.mark.parametrize(("dim", "double", "lists", "tree"), sparing(VARIANTS, PAIRWISE))
 def test_variants_compile(dim, double, lists, tree):
     """For float bounds that hold, and are those of the CPU: nothing is contracted."""
     programs = {kernel.program for kernel in triangles_cuda.triangle_kernels(dim, double, lists, tree, WIDTH)}

@@ -10,6 +10,7 @@ from itertools import product
 
 import numpy as np
 import pytest
+from checked import slow
 from reference import reference_images
 
 from jfrnn.cases.periodic import PERIODIC_CASES
@@ -17,7 +18,7 @@ from jfrnn.cases.periodic import PERIODIC_CASES
 DTYPES = (np.float32, np.float64)
 DIMS = (2, 3)
 BUILDS = list(product(DTYPES, DIMS))
-OFTEN = [*BUILDS[1:3], *(pytest.param(*each, marks=pytest.mark.slow) for each in BUILDS[::3])]  # either width, either dimension
+OFTEN = [*BUILDS[1:3], *(slow(*each) for each in BUILDS[::3])]  # either width, either dimension
 ULP_CASES = [name for name in PERIODIC_CASES if name.startswith("ulp_")]
 TIE_CASES = [name for name in PERIODIC_CASES if name.startswith("ties_")]
 EMPTY = {"alone_wide", "n_0", "n_1", "queries_none_in_reach", "queries_beside_slab", "no_queries", "no_sources"}
@@ -77,7 +78,7 @@ def exact_squared(given, image):
 # Every case
 
 
-@pytest.mark.parametrize("builds", [BUILDS[1:3], pytest.param(BUILDS[::3], marks=pytest.mark.slow)], ids=["often", "rarely"])
+@pytest.mark.parametrize("builds", [BUILDS[1:3], slow(BUILDS[::3])], ids=["often", "rarely"])
 @pytest.mark.parametrize("name", PERIODIC_CASES)
 def test_case_is_what_it_says(name, builds):
     case = PERIODIC_CASES[name]
@@ -109,7 +110,7 @@ def test_cases_refuse_other_dtypes_and_dimensions():
             PERIODIC_CASES["random"].build(dtype, dim)
 
 
-@pytest.mark.parametrize("builds", [BUILDS[1:3], pytest.param(BUILDS[::3], marks=pytest.mark.slow)], ids=["often", "rarely"])
+@pytest.mark.parametrize("builds", [BUILDS[1:3], slow(BUILDS[::3])], ids=["often", "rarely"])
 @pytest.mark.parametrize("name", PERIODIC_CASES)
 def test_case_has_the_pairs_it_is_about(name, builds):
     for dtype, dim in builds:
@@ -320,7 +321,7 @@ def test_cells_are_skewed_as_said(dtype, dim):
 # At the cutoff
 
 
-@pytest.mark.parametrize(("dtype", "dim"), [*BUILDS[:3], pytest.param(*BUILDS[3], marks=pytest.mark.slow)])
+@pytest.mark.parametrize(("dtype", "dim"), [*BUILDS[:3], slow(*BUILDS[3])])
 def test_crystals_have_ties_through_faces(dtype, dim):
     for name in (
         "crystal_integer",

@@ -4,6 +4,7 @@ from itertools import combinations, product
 
 import numpy as np
 import pytest
+from checked import slow
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from reference import compare, is_pair, pairs_of, reference_images, reference_pairs
@@ -13,10 +14,8 @@ from jfrnn.cases.hard import HARD_CASES
 DTYPES = (np.float32, np.float64)
 DIMS = (2, 3)
 BUILDS = list(product(DTYPES, DIMS))
-OFTEN = [*BUILDS[1:3], *(pytest.param(*each, marks=pytest.mark.slow) for each in BUILDS[::3])]  # either width, either dimension
-IN_PARTS = pytest.mark.parametrize(
-    "builds", [BUILDS[1:3], pytest.param(BUILDS[::3], marks=pytest.mark.slow)], ids=["often", "rarely"]
-)
+OFTEN = [*BUILDS[1:3], *(slow(*each) for each in BUILDS[::3])]  # either width, either dimension
+IN_PARTS = pytest.mark.parametrize("builds", [BUILDS[1:3], slow(BUILDS[::3])], ids=["often", "rarely"])
 ULP_CASES = [name for name in HARD_CASES if name.startswith("ulp_")]
 
 

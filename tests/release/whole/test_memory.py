@@ -11,6 +11,7 @@ import jax
 import numpy as np
 import pytest
 import warp as wp
+from checked import slow
 from places import ROOT, TESTS
 
 import jfrnn
@@ -103,14 +104,10 @@ def test_few_particles_take_no_scratch_on_a_gpu():
     assert min(others) > 40
 
 
-@pytest.mark.parametrize("backend", ["jax", pytest.param("brute", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("backend", ["jax", slow("brute")])
 @pytest.mark.parametrize(
     ("n", "capacity", "dim", "dtype", "queries"),
-    [
-        pytest.param(1000, 40, 3, np.float32, None, marks=pytest.mark.slow),
-        (300_000, 256, 2, np.float64, None),
-        pytest.param(1000, 40, 2, np.float32, 30_000, marks=pytest.mark.slow),
-    ],
+    [slow(1000, 40, 3, np.float32, None), (300_000, 256, 2, np.float64, None), slow(1000, 40, 2, np.float32, 30_000)],
 )
 def test_compiled_engines_take_what_was_planned(n, capacity, dim, dtype, queries, backend):
     plan = jfrnn.memory_plan(n, 0.1, capacity, dim=dim, dtype=dtype, queries=queries, backend=backend)
@@ -151,7 +148,7 @@ print(memory.source, memory.peak() - memory.start, blobs.cutoff, int(found.requi
 """
 
 
-@pytest.mark.parametrize("backend", ["warp", pytest.param("hashgrid", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("backend", ["warp", slow("hashgrid")])
 def test_two_blobs_cost_the_same_however_far_apart(backend):
     """Both take what was planned, whatever the box; the nearer ones leave some pages of it untouched.
 
@@ -348,7 +345,7 @@ def test_float64_without_x64_is_refused():
         jfrnn.memory_plan(10, 0.1, 8, dtype=np.float64)
 
 
-@pytest.mark.parametrize("dtype", [np.float32, pytest.param(np.float64, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("dtype", [np.float32, slow(np.float64)])
 def test_options_of_warp_take_what_is_stated(dtype):
     """A box or a batch copies the positions, and cutoffs per particle are prepared by XLA: bytes per particle, the list apart."""
     n = 20_000

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
+from checked import slow
 
 import jfrnn
 from jfrnn._tracing import on_device
@@ -142,13 +143,7 @@ def balanced(r, i, j):
 
 
 @pytest.mark.parametrize(
-    "options",
-    [
-        pytest.param({}, marks=pytest.mark.slow),
-        pytest.param({"box": BOX}, marks=pytest.mark.slow),
-        {"fn": balanced, "symmetry": "antisymmetric"},
-    ],
-    ids=["open", "box", "symmetry"],
+    "options", [slow({}), slow({"box": BOX}), {"fn": balanced, "symmetry": "antisymmetric"}], ids=["open", "box", "symmetry"]
 )
 def test_a_sum_over_pairs_of_a_new_size_compiles_one_program_or_in_a_box_two(options):
     given = {"fn": energy} | options
@@ -188,7 +183,7 @@ def test_programs_of_few_particles_run_on_the_thread_that_calls_them():
     assert [program.cost_analysis()["flops"] for program in found] == [-1, -1]  # those of a kernel count as -1; both sums are one
 
 
-@pytest.mark.parametrize("half", [pytest.param(False, marks=pytest.mark.slow), True])
+@pytest.mark.parametrize("half", [slow(False), True])
 def test_a_sum_over_a_list_of_a_new_size_compiles_two_programs_and_vectors(half):
     x, y = scene(next(SIZES)), scene(next(SIZES))
     jfrnn.pair_sum(energy, x, None, neighbors=jfrnn.search(x, 0.6, half=half))

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from checked import slow
 from places import ROOT
 
 import jfrnn
@@ -295,7 +296,7 @@ def everything(every):
     return {name: [*cells, outside.get(name, ""), inside.get(name, "")] for name, cells in observed(every).items()}
 
 
-@pytest.mark.parametrize("every", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["in_turns", "every"])
+@pytest.mark.parametrize("every", [False, slow(True)], ids=["in_turns", "every"])
 def test_the_page_says_what_every_call_does(every):
     assert rows_of_page("Searches, lists and sums") == as_rows(everything(every))
 

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from checked import slow
 from jax.sharding import PartitionSpec
 
 import jfrnn
@@ -123,7 +124,7 @@ def test_every_public_name_is_mapped_or_refused():
     assert [name for name in sorted((methods | functions) - apart) if name not in said] == []
 
 
-@pytest.mark.parametrize("backend", ["warp", "hashgrid", pytest.param("jax", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("backend", ["warp", "hashgrid", slow("jax")])
 def test_cond_and_shard_map_on_one_device(backend):
     def listed(x):
         nbrs = jfrnn.search(x, CUTOFF, capacity=CAPACITY, backend=backend)

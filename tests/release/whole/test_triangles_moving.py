@@ -9,11 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
+from checked import slow
 
 import jfrnn
 from jfrnn.cases import meshes
 
-BACKENDS = [pytest.param("jax", marks=pytest.mark.slow), "warp", "bvh"]
+BACKENDS = [slow("jax"), "warp", "bvh"]
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
