@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
-from checked import slow, slowly, sparing
+from checked import as_set, slots_as_set, slow, slowly, sparing
 
 from jfrnn import jax_md
 
@@ -54,12 +54,9 @@ def points(fractional, n=N):
 
 def pairs_of(idx, n, form):
     if form.name == "Dense":
-        i, k = np.nonzero(np.asarray(idx) < n)
-        found = list(zip(i.tolist(), np.asarray(idx)[i, k].tolist()))
-    else:
-        found = [(i, j) for j, i in np.asarray(idx).T.tolist() if j < n]
-    assert len(found) == len(set(found))
-    return set(found)
+        return slots_as_set(idx, np.asarray(idx) < n)
+    used = np.asarray(idx)[0] < n
+    return as_set(*np.asarray(idx)[::-1, used])
 
 
 def expected(x, space, form, skin=SKIN):
@@ -270,9 +267,8 @@ def test_several_images(form, fractional):
         else:
             used = np.asarray(nbrs.receivers) < 6
             i, j, s = (np.asarray(part)[used] for part in (nbrs.receivers, nbrs.senders, nbrs.shifts))
-        found = list(zip(i.tolist(), j.tolist(), map(tuple, s.astype(int).tolist())))
-        assert set(found) == within
-        assert len(found) == len(within) == nbrs.n_edges
+        assert as_set(i, j, s) == within
+        assert len(within) == nbrs.n_edges
         assert (nbrs.shifts.dtype, bool(nbrs.did_buffer_overflow)) == (np.int32, False)
     assert update(given, nbrs, 0.2 * matrix).did_buffer_overflow
     assert update(lost, nbrs, matrix).did_buffer_overflow  # though there is room for all that are found
@@ -373,7 +369,5 @@ def test_particles_that_nobody_wrapped_are_found():
     form = jax_md.OrderedSparse
     many = jax_md.neighbor_list_multi_image(None, edge * np.eye(3), 1.0, fractional_coordinates=False, format=form).allocate(far)
     used = np.asarray(many.senders) < 60
-    i, j, shifts = (np.asarray(part)[used].astype(int).tolist() for part in (many.receivers, many.senders, many.shifts))
-    found = list(zip(i, j, map(tuple, shifts)))
-    assert len(found) == len(set(found))
-    assert set(found) == {(i, j, s) for i, j, s in expected if s > (0, 0, 0) or (s == (0, 0, 0) and i < j)}
+    found = as_set(*(np.asarray(part)[used] for part in (many.receivers, many.senders, many.shifts)))
+    assert found == {(i, j, s) for i, j, s in expected if s > (0, 0, 0) or (s == (0, 0, 0) and i < j)}

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
-from checked import slow
+from checked import slow, slowly
 
 import jfrnn
 from jfrnn._engine import arrays, blocks, tuning
@@ -34,26 +34,14 @@ def elsewhere(monkeypatch):
     jax.clear_caches()
 
 
-@SLOW
-@pytest.mark.parametrize("name", HARD_CASES)
-def test_numbers_of_accelerators_find_the_same_pairs(name, elsewhere):
-    if name == "denormal_lattice":
-        pytest.skip("its cutoff is refused")
-    given = HARD_CASES[name].build(np.float32, 3)
-    nbrs = checked.search_padded(given, max(704, len(given.positions)), 704, backend="jax")
-    checked.assert_pairs(nbrs, reference.reference_pairs(given.positions, given.cutoff, queries=given.queries))
+NUMBERS = {"elsewhere": ELSEWHERE, "all rows of a block at once": AT_ONCE, "blocks in loops": LOOPS}
+EACH = [("elsewhere", name) for name in HARD_CASES if name != "denormal_lattice"]  # whose cutoff is refused
+EACH += [(numbers, name) for numbers in NUMBERS if numbers != "elsewhere" for name in TIES]
 
 
-@pytest.mark.parametrize(
-    ("name", "numbers"),
-    [
-        (name, numbers) if (name, numbers) == ("lattice_1e-4_at_0", "AT_ONCE") else slow(name, numbers)
-        for name in TIES
-        for numbers in ("AT_ONCE", "LOOPS")
-    ],
-)
-def test_all_rows_of_a_block_at_once_and_blocks_in_loops(name, numbers, elsewhere, monkeypatch):
-    monkeypatch.setattr(tuning, "CPU", {"AT_ONCE": AT_ONCE, "LOOPS": LOOPS}[numbers])
+@pytest.mark.parametrize(("numbers", "name"), slowly(*EACH))
+def test_numbers_of_accelerators_find_the_same_pairs(numbers, name, elsewhere, monkeypatch):
+    monkeypatch.setattr(tuning, "CPU", NUMBERS[numbers])
     given = HARD_CASES[name].build(np.float32, 3)
     nbrs = checked.search_padded(given, max(704, len(given.positions)), 704, backend="jax")
     checked.assert_pairs(nbrs, reference.reference_pairs(given.positions, given.cutoff, queries=given.queries))

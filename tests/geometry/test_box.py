@@ -28,6 +28,8 @@ def image_pairs(nbrs, positions, queries=None):
     """Return (i, j, S) of every used slot, after checking padding and counts; S is found without the library's vectors."""
     assert not nbrs.overflow
     idx, count = np.asarray(nbrs.idx), np.asarray(nbrs.count)
+    if nbrs.box is None:
+        return {(*pair, (0,) * np.shape(positions)[1]) for pair in reference.pairs_of(idx, count, nbrs.source_count)}
     used = np.arange(nbrs.capacity) < count[:, None]
     assert (idx[~used] == nbrs.source_count).all()
     i, k = np.nonzero(used)
@@ -43,9 +45,7 @@ def image_pairs(nbrs, positions, queries=None):
         turns, query_turns = (None if t is None else np.asarray(unpacked(t, nbrs.box.dim)) for t in nbrs.images[1:])
         shifts = kind.shifts[np.asarray(nbrs.images.codes)[i, k]] + (turns if query_turns is None else query_turns)[i] - turns[j]
         shifts = shifts @ kind.numbers  # of given vectors, where the list counts short ones
-    pairs = list(zip(i.tolist(), j.tolist(), map(tuple, shifts.tolist()), strict=True))
-    assert len(set(pairs)) == len(pairs)
-    return set(pairs)
+    return checked.as_set(i, j, shifts)
 
 
 @jax.jit
@@ -53,14 +53,11 @@ def shifts_and_mask(nbrs, positions, options):
     return nbrs.shifts(positions, **options), nbrs.vectors(positions, **options)[1]
 
 
-def masked_images(nbrs, positions, **options):
-    """Return (i, j, S) of every pair within the true cutoff, as the list's own geometry has them."""
+def masked_images(nbrs, positions, found=None, **options):
+    """Return (i, j, S) of every pair within the true cutoff, as the list's own geometry has them: `found`, or asked here."""
     assert not nbrs.overflow
-    shifts, mask = map(np.asarray, shifts_and_mask(nbrs, positions, options))
-    i, k = np.nonzero(mask)
-    pairs = list(zip(i.tolist(), np.asarray(nbrs.idx)[i, k].tolist(), map(tuple, shifts[i, k].tolist()), strict=True))
-    assert len(set(pairs)) == len(pairs)
-    return set(pairs)
+    shifts, mask = shifts_and_mask(nbrs, positions, options) if found is None else found
+    return checked.slots_as_set(nbrs.idx, mask, shifts)
 
 
 @functools.lru_cache(maxsize=4)
@@ -90,13 +87,9 @@ def assert_case(name, dtype, dim, backend, *, closed=False, geometry=False, imag
     x, expected = jnp.asarray(checked.padded(given.positions, LENGTH)), expected_images(name, dtype, dim, closed)
     nbrs = jfrnn.search(x, given.cutoff, box=box, backend=backend, capacity=CAPACITY, closed=closed, **queries)
     assert jfrnn.Status(int(nbrs.status)) == jfrnn.Status.NONFINITE  # the padding
-    if box is None:
-        found = reference.pairs_of(np.asarray(nbrs.idx), np.asarray(nbrs.count), nbrs.source_count)
-        assert {(i, j, (0,) * dim) for i, j in found} == expected
-        return
-    for found in [image_pairs(nbrs, x, **queries), *([masked_images(nbrs, x, **queries)] if geometry else [])]:
-        missing, extra = expected - found, found - expected
-        assert (len(missing), len(extra)) == (0, 0), f"missing {sorted(missing)[:5]}, extra {sorted(extra)[:5]} of {len(expected)}"
+    checked.assert_same(image_pairs(nbrs, x, **queries), expected)
+    if geometry and box is not None:
+        checked.assert_same(masked_images(nbrs, x, **queries), expected)
 
 
 TIED = [name for name in PERIODIC_CASES if any(word in name for word in ("ties", "crystal", "cutoffs", "residues", "_supercell"))]

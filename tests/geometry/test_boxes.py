@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import reference
 from by_numpy import in_order
-from checked import padded, slow
+from checked import as_set, assert_same, padded, slow
 from test_box import LONG, energy_and_slopes, masked_images, unpacked
 
 import jfrnn
@@ -68,9 +68,7 @@ def listed_images(nbrs, x, **queries):
         shifts = kind.shifts[np.asarray(nbrs.images.codes)[i, k]] + (turns if of_rows is None else of_rows)[i] - turns[j]
         if nbrs.box.numbers is not None:  # of given vectors, where the list counts short ones
             shifts = np.einsum("ps,psd->pd", shifts, np.asarray(nbrs.box.numbers)[system]).astype(int)
-    pairs = set(zip(i.tolist(), j.tolist(), map(tuple, shifts.tolist()), strict=True))
-    assert len(pairs) == len(i)
-    return pairs
+    return as_set(i, j, shifts)
 
 
 def box_of(given):
@@ -100,9 +98,7 @@ def assert_case(name, dtype, dim, backend, closed=False, half=False, geometry=Fa
     options = {"box": box, "batch": batch, "backend": backend, "closed": closed, "half": half}
     nbrs = jfrnn.search(jnp.asarray(x), given.cutoff, capacity=CAPACITY[dim], **queries, **options)
     nbrs.check()
-    found = masked_images(nbrs, x, **queries) if geometry else listed_images(nbrs, x, **queries)
-    missing, extra = expected - found, found - expected
-    assert (len(missing), len(extra)) == (0, 0), f"missing {sorted(missing)[:5]}, extra {sorted(extra)[:5]} of {len(expected)}"
+    assert_same(masked_images(nbrs, x, **queries) if geometry else listed_images(nbrs, x, **queries), expected)
     assert int(np.asarray(nbrs.count).sum()) == len(expected) > 0
     assert nbrs.backend == backend
     assert (nbrs.images is None) == (name == "nearest")

@@ -12,6 +12,7 @@ from by_numpy import in_order
 from checked import slow
 from test_box import masked_images, pull_back
 from test_boxes import box_of, listed_images, system_by_system
+from test_search_edges import edges_as_set
 
 import jfrnn
 from jfrnn._geometry.cutoffs import RULES
@@ -110,11 +111,7 @@ def test_options_and_flat_lists(who, backend):
     flat = given.search(backend, jfrnn.search_edges, half=True, closed=True, exclude=exclude, total=1024)
     flat.check()
     edges = jax.jit(lambda flat, x: flat.edges(x))(flat, given.x)
-    receivers, senders, shifts = (
-        np.asarray(part)[np.asarray(edges.mask)] for part in (edges.receivers, edges.senders, edges.shift)
-    )
-    assert int(edges.pair_count) == len(expected) == len(senders)
-    assert set(zip(receivers.tolist(), senders.tolist(), map(tuple, shifts.tolist()), strict=True)) == expected
+    assert edges_as_set(edges) == expected
     if backend == "warp" and who == "either":
         nbrs = given.search(backend, half=True, exclude=exclude)
         assert masked_images(nbrs, given.x) == reference.without_excluded(given.pairs(half=True), exclude)

@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
-from checked import slow
+from checked import slots_as_set, slow
+from test_search_edges import edges_as_set
 
 import jfrnn
 from jfrnn._geometry.far import move_near
@@ -49,18 +50,6 @@ def scene(cell, far, dtype, seed=0):
     return x, matrix
 
 
-def triples(first, second, shifts, mask):
-    where = np.nonzero(np.asarray(mask))
-    named = (np.asarray(first)[where].tolist(), np.asarray(second)[where].tolist(), map(tuple, np.asarray(shifts)[where].tolist()))
-    found = list(zip(*named, strict=True))
-    assert len(set(found)) == len(found)
-    return set(found)
-
-
-def ends_of(edges):
-    return triples(edges.receivers, edges.senders, edges.shift, edges.mask)
-
-
 @pytest.mark.parametrize(("cell", "backend", "far", "dtype"), list(each_case()))
 def test_pairs_shifts_and_sums(cell, backend, far, dtype):
     x, matrix = scene(cell, far, dtype)
@@ -83,11 +72,10 @@ def test_pairs_shifts_and_sums(cell, backend, far, dtype):
 
     nbrs, (vectors, mask), shifts, told = all_of(x)
     nbrs.check()
-    rows = np.broadcast_to(np.arange(N)[:, None], nbrs.idx.shape)
-    assert triples(rows, nbrs.idx, shifts, mask) == expected
+    assert slots_as_set(nbrs.idx, mask, shifts) == expected
     for name, found in told.items():
         if "edges" in name:
-            assert ends_of(found) == expected
+            assert edges_as_set(found) == expected
         else:
             np.testing.assert_array_equal(found, count)
     exact = [Fraction(v) for v in matrix.astype(float).reshape(-1).tolist()]
@@ -110,8 +98,7 @@ def test_a_list_with_a_skin_follows_them_and_wrapping_is_no_motion():
     for step, moved in enumerate((x, x + 0.02 * rng.normal(size=x.shape), x % np.diag(matrix), x + 300 * np.diag(matrix))):
         nbrs = nbrs.update(moved)
         expected = reference.reference_images(moved, CUTOFF, matrix=matrix, periodic=(True,) * 3)
-        rows = np.broadcast_to(np.arange(N)[:, None], nbrs.idx.shape)
-        assert triples(rows, nbrs.idx, nbrs.shifts(moved), nbrs.distances(moved)[1]) == expected, step
+        assert slots_as_set(nbrs.idx, nbrs.distances(moved)[1], nbrs.shifts(moved)) == expected, step
     assert int(nbrs.rebuild_count) <= 1
 
 
@@ -135,12 +122,11 @@ def test_boxes_of_systems():
 
     nbrs, shifts, mask = all_of(both)
     nbrs.check()
-    rows = np.broadcast_to(np.arange(2 * N)[:, None], nbrs.idx.shape)
     expected = set()
     for k, (points, matrix) in enumerate(((x, first), (y, second))):
         found = reference.reference_images(points, CUTOFF, matrix=matrix, periodic=(True,) * 3)
         expected |= {(i + k * N, j + k * N, shift) for i, j, shift in found}
-    assert triples(rows, nbrs.idx, shifts, mask) == expected
+    assert slots_as_set(nbrs.idx, mask, shifts) == expected
 
 
 def test_derivatives_in_positions_and_box():

@@ -1,7 +1,5 @@
 """Meshes of walls are closed, turned outwards, and of the sizes that they say."""
 
-import doctest
-import importlib
 import math
 from collections import Counter
 
@@ -121,8 +119,3 @@ def test_what_is_refused():
         meshes.gear_outline(20, pressure_angle=45.0)
     with pytest.raises(ValueError, match="teeth must lie"):
         meshes.gear(4)
-
-
-def test_examples():
-    result = doctest.testmod(importlib.import_module("jfrnn.cases.meshes"))
-    assert (result.attempted > 0, result.failed) == (True, 0)

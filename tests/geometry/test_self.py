@@ -2,6 +2,7 @@
 
 from itertools import product
 
+import checked
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -53,11 +54,6 @@ def each_pair(who, x, cutoff, more, kind, batch, closed):
                 if mine == reach:
                     found.add((int(members[i]), int(members[j]), shift))
     return found
-
-
-def pairs_and_shifts(idx, shifts, mask):
-    i, k = np.nonzero(np.asarray(mask))
-    return set(zip(i.tolist(), np.asarray(idx)[i, k].tolist(), map(tuple, np.asarray(shifts)[i, k].tolist()), strict=True))
 
 
 ALL = {"half", "edges", "sums", "sums of a list"}
@@ -116,8 +112,8 @@ def test_everyone_is_its_own_neighbor(who, kind, backend, dtype, parts):
 
     (nbrs, shifts, mask), found = find(x, cutoff)
     assert jfrnn.Status(int(nbrs.status)) == jfrnn.Status.NONFINITE
-    assert pairs_and_shifts(nbrs.idx, shifts, mask) == expected
-    assert pairs_and_shifts(nbrs.idx, shifts, np.asarray(nbrs.idx) < N) == expected
+    for held in (mask, np.asarray(nbrs.idx) < N):
+        assert checked.slots_as_set(nbrs.idx, held, shifts) == expected
     np.testing.assert_array_equal(nbrs.count, counts)
     there = np.isfinite(x).all(axis=1)
     for name in parts & {"sums", "sums of a list"}:
@@ -125,9 +121,9 @@ def test_everyone_is_its_own_neighbor(who, kind, backend, dtype, parts):
     if "edges" in parts:
         assert found["edges"] == total
     if "half" in parts:
-        half, *geometry = found["half"]
+        half, shifts, mask = found["half"]
         mirrored = {(i, j, s) for i, j, s in expected if i < j or (i == j and s >= (0, 0, 0))}
-        assert pairs_and_shifts(half.idx, *geometry) == mirrored
+        assert checked.slots_as_set(half.idx, mask, shifts) == mirrored
 
 
 @pytest.mark.parametrize(("who", "flat"), [("gather", False), *(slow(*k) for k in product(WHO, (False, True)))])
@@ -142,14 +138,13 @@ def test_a_list_with_a_skin_keeps_them(who, flat):
         return nbrs, nbrs.edges(x) if flat else nbrs.vectors(x)[1]
 
     for moved in (x, x + np.float32(0.001) * np.random.default_rng(1).normal(size=x.shape).astype(np.float32)):
-        expected = each_pair(who, moved, cutoff, more, "open", None, False)
+        expected = {pair[:2] for pair in each_pair(who, moved, cutoff, more, "open", None, False)}
         after, found = updated(nbrs, moved)
         if flat:
-            mask = np.asarray(found.mask)
-            ends = zip(np.asarray(found.receivers)[mask].tolist(), np.asarray(found.senders)[mask].tolist(), strict=True)
-            assert {(i, j, (0, 0, 0)) for i, j in ends} == expected
+            ends = (np.asarray(part)[np.asarray(found.mask)] for part in (found.receivers, found.senders))
+            assert checked.as_set(*ends) == expected
         else:
-            assert pairs_and_shifts(after.idx, np.zeros((*after.idx.shape, 3), int), found) == expected
+            assert checked.slots_as_set(after.idx, found) == expected
 
 
 def test_separate_queries_have_no_self():

@@ -246,7 +246,7 @@ def test_examples_in_docstrings():
     assert {test.name for test in examples if doctest.DocTestRunner().run(test).failed} == set()
 
 
-@pytest.mark.parametrize("table", ["batches", "catalog", "hard", "radii"])
+@pytest.mark.parametrize("table", ["_build", "batches", "catalog", "hard", "meshes", "periodic", "radii", "triangles"])
 def test_examples_in_cases(table):
     result = doctest.testmod(importlib.import_module(f"jfrnn.cases.{table}"))
     assert (result.attempted > 0, result.failed) == (True, 0)

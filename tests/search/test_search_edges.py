@@ -1,5 +1,6 @@
 """`search_edges`: flat lists of edges against the oracle, what too small a total says, and their geometry against padded lists."""
 
+import checked
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -34,11 +35,8 @@ def oracle(x, box, **options):
 
 def edges_as_set(edges):
     """Return (i, j, S) of the edges, after checking that each is there once, and sorted by receiver."""
-    real = np.asarray(edges.mask)
-    columns = (np.asarray(x)[real].tolist() for x in (edges.receivers, edges.senders, edges.shift))
-    triples = [(i, j, tuple(shift)) for i, j, shift in zip(*columns, strict=True)]
-    found = set(triples)
-    assert len(found) == len(triples) == int(edges.pair_count)
+    found = checked.as_set(*(np.asarray(x)[np.asarray(edges.mask)] for x in (edges.receivers, edges.senders, edges.shift)))
+    assert len(found) == int(edges.pair_count)
     assert (np.diff(edges.receivers) >= 0).all()
     return found
 
@@ -51,8 +49,7 @@ def assert_right(nbrs, x, expected, queries=None):
     assert (np.asarray(nbrs.senders)[held:] == len(x)).all()
     assert (np.asarray(nbrs.receivers)[held:] == m).all()
     np.testing.assert_array_equal(np.diff(nbrs.offsets), np.bincount(np.asarray(nbrs.receivers)[:held], minlength=m))
-    i, j = nbrs.pairs()
-    assert set(zip(i.tolist(), j.tolist(), strict=True)) == {pair[:2] for pair in expected}
+    assert set(zip(*(part.tolist() for part in nbrs.pairs()), strict=True)) == {pair[:2] for pair in expected}
     nbrs.check()
 
 

@@ -4,6 +4,7 @@ from fractions import Fraction
 from itertools import product
 
 import by_numpy
+import checked
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -26,11 +27,7 @@ distances = jax.jit(jfrnn.NeighborList.distances)
 def masked_pairs(nbrs, x, **options):
     """Return the pairs of a list within the true cutoff at these positions."""
     assert not nbrs.overflow
-    _, mask = distances(nbrs, x, **options)
-    i, k = np.nonzero(np.asarray(mask))
-    pairs = list(zip(i.tolist(), np.asarray(nbrs.idx)[i, k].tolist(), strict=True))
-    assert len(pairs) == len(set(pairs))
-    return set(pairs)
+    return checked.slots_as_set(nbrs.idx, distances(nbrs, x, **options)[1])
 
 
 def points(n, dim, dtype, seed=0):

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import reference
 from checked import slow
+from test_box import masked_images, shifts_and_mask
 
 import jfrnn
 
@@ -18,22 +19,6 @@ SKEWED = np.array([[1.0, 0.0, 0.0], [0.45, 0.9, 0.0], [-0.3, 0.35, 1.1]])
 def oracle(x, cutoff, box, **options):
     rows = np.asarray(box.vectors)
     return reference.reference_images(np.asarray(x), cutoff, matrix=rows, periodic=box.periodic, **options)
-
-
-@jax.jit
-def geometry(nbrs, x, queries=None):
-    return nbrs.shifts(x, queries=queries), nbrs.vectors(x, queries=queries)[1]
-
-
-def masked_images(nbrs, x, found=None, **options):
-    """Return (i, j, S) of every pair within the true cutoff, as the list's own geometry has them."""
-    assert not nbrs.overflow
-    shifts, mask = map(np.asarray, geometry(nbrs, x, **options) if found is None else found)
-    i, k = np.nonzero(mask)
-    named = by_numpy.Pairs(i, np.asarray(nbrs.idx)[i, k], shifts[i, k])
-    pairs = by_numpy.named(named)
-    assert len(pairs) == len(i)
-    return pairs
 
 
 def rows_of(box):
@@ -107,7 +92,7 @@ def test_images_of_a_kept_list_are_those_of_the_moved_particles(dtype, kind, ask
     def all_of(nbrs, x, **given):
         kept = nbrs.update(x, **given) if kind in UPDATED or (dtype, kind, asked) not in EACH else nbrs
         sums = None if (kind, asked) != ("skewed", "own") else jfrnn.pair_sum(weight, x, None, neighbors=kept)
-        return kept, geometry(kept, x, **given), sums
+        return kept, shifts_and_mask(kept, x, given), sums
 
     kept, found, sums = all_of(nbrs, after, **given)
     kept.check()

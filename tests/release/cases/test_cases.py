@@ -1,5 +1,3 @@
-import doctest
-import importlib
 import math
 from itertools import pairwise
 
@@ -355,6 +353,11 @@ def test_layout_functions_give_the_positions_of_their_scene():
         ("jitter", {"amplitude": 1.5}, ValueError, r"amplitude must lie in \(0, 1\], got 1.5"),
         ("clump", {"density": -1.0}, ValueError, "density must be finite and above 0, got -1.0"),
         ("clump", {"fill": 0.9, "density": 1.0}, ValueError, "more than half the shortest side.*raise density"),
+        ("turned4", {"fill": 0.3}, ValueError, r"fill=0.3 makes cubes of 8 sites .* of 12.5 sites: take 0.11 at most, or fewer"),
+        ("turned4", {"angle": float("nan")}, ValueError, "angle must be finite, got nan"),
+        ("tumbled4", {"angle": 3.0}, ValueError, "angle=3.0 is not an argument of .*'tumbled4', which takes fill, seed: drop it"),
+        ("grown4", {"growth": 0.5}, ValueError, "growth must be at least 1, got 0.5"),
+        ("turnedN", {}, ValueError, "name must be a known layout, got 'turnedN': .* clustersN, turnedN, tumbledN, cutN, grownN"),
     ],
 )
 def test_scene_says_what_is_wrong(name, options, error, match):
@@ -391,8 +394,3 @@ def test_a_scene_by_hand_says_what_is_wrong(changes, match):
     fields = {"positions": np.zeros((2, 2)), "cutoff": 0.5, "spacing": 0.1, "lengths": (1.0, 1.0), "fill": 0.1}
     with pytest.raises(ValueError, match=match):
         cases.Scene("pair", **(fields | changes))
-
-
-def test_the_example_in_the_docstring():
-    result = doctest.testmod(importlib.import_module("jfrnn.cases._build"))
-    assert (result.attempted, result.failed) == (2, 0)

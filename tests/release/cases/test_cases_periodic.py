@@ -1,9 +1,7 @@
 """The periodic cases have the properties that they claim, by the oracle."""
 
 import dataclasses
-import doctest
 import functools
-import importlib
 from collections import Counter
 from fractions import Fraction
 from itertools import product
@@ -80,38 +78,6 @@ def exact_squared(given, image):
 
 @pytest.mark.parametrize("builds", [BUILDS[1:3], slow(BUILDS[::3])], ids=["often", "rarely"])
 @pytest.mark.parametrize("name", PERIODIC_CASES)
-def test_case_is_what_it_says(name, builds):
-    case = PERIODIC_CASES[name]
-    assert case.name == name
-    assert case.mechanism and "\n" not in case.mechanism
-    for dtype, dim in builds:
-        given, again = case.build(dtype, dim), case.build(np.dtype(dtype).name, dim)
-        assert type(given.cutoff) is float and given.cutoff == again.cutoff
-        assert 0 < dtype(given.cutoff) < np.inf
-        assert given.matrix.dtype == dtype and given.matrix.shape in ((dim,), (dim, dim))
-        assert given.matrix.tobytes() == again.matrix.tobytes()
-        assert np.isfinite(given.matrix).all() and (heights_of(given) > 0).all()
-        assert type(given.periodic) is tuple and len(given.periodic) == dim and {*map(type, given.periodic)} == {bool}
-        for points, repeated in ((given.positions, again.positions), (given.queries, again.queries)):
-            if points is None:
-                assert repeated is None
-                continue
-            assert points.dtype == dtype and points.ndim == 2 and points.shape[1] == dim
-            assert len(points) <= 300
-            assert np.isfinite(points).all() != name.startswith("nonfinite")
-            assert points.tobytes() == repeated.tobytes()
-            # so that a machine which flushes denormals can be told by the name of the case
-            assert "denormal" in name or not ((points != 0) & (np.abs(points) < np.finfo(dtype).tiny)).any()
-
-
-def test_cases_refuse_other_dtypes_and_dimensions():
-    for dtype, dim in ((np.float16, 3), (np.int32, 2), (np.float32, 1)):
-        with pytest.raises(ValueError, match="float32 or float64, in 2 or 3"):
-            PERIODIC_CASES["random"].build(dtype, dim)
-
-
-@pytest.mark.parametrize("builds", [BUILDS[1:3], slow(BUILDS[::3])], ids=["often", "rarely"])
-@pytest.mark.parametrize("name", PERIODIC_CASES)
 def test_case_has_the_pairs_it_is_about(name, builds):
     for dtype, dim in builds:
         found = images_of(name, dtype, dim, closed=True)
@@ -123,11 +89,6 @@ def test_case_has_the_pairs_it_is_about(name, builds):
         open_in_2d = name == "periodic_z" and dim == 2
         if name != "n_2":  # where two particles happen to be
             assert bool(crossing(found)) == (name not in UNCROSSED and not open_in_2d)
-
-
-def test_the_example_in_the_docstring():
-    result = doctest.testmod(importlib.import_module("jfrnn.cases.periodic"))
-    assert (result.attempted, result.failed) == (3, 0)
 
 
 # Where the points are

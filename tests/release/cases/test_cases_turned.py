@@ -77,18 +77,3 @@ def test_grown_draws_the_cubes_apart(growth):
     assert pairs_at(scene.positions, 3.05e-4) == pairs_at(cases.turned(DOMAIN, 4, angle=0.0), 3.05e-4)
     middle = scene.positions.reshape(128, 216, 3).mean(axis=1)
     assert np.ptp(middle, axis=0) == pytest.approx(growth ** (1 / 3) * np.array([3 / 4, 7 / 8, 3 / 4]) * DOMAIN.lengths)
-
-
-@pytest.mark.parametrize(
-    ("name", "options", "match"),
-    [
-        ("turned4", {"fill": 0.3}, r"fill=0.3 makes cubes of 8 sites .* tiles of 12.5 sites: take 0.11 at most, or fewer tiles"),
-        ("turned4", {"angle": float("nan")}, "angle must be finite, got nan"),
-        ("tumbled4", {"angle": 3.0}, "angle=3.0 is not an argument of the layout 'tumbled4', which takes fill, seed: drop it"),
-        ("grown4", {"growth": 0.5}, "growth must be at least 1, got 0.5"),
-        ("turnedN", {}, "name must be a known layout, got 'turnedN': .* clustersN, turnedN, tumbledN, cutN, grownN"),
-    ],
-)
-def test_what_is_wrong_is_said(name, options, match):
-    with pytest.raises(ValueError, match=match):
-        cases.scene(name, **options)

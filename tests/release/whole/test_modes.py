@@ -288,16 +288,10 @@ def test_every_public_name_is_in_a_mode():
     assert sorted(functions - asked) == []
 
 
-def test_arrays_of_numpy_are_the_callers_to_move():
-    """A guard against transfers still finds those of the caller."""
-    x = np.zeros((4, 3), np.float32)
-    with jax.transfer_guard("disallow"), pytest.raises(Exception, match="Disallowed host-to-device transfer"):
-        jfrnn.count(x, 1.0)
-
-
-def test_a_guard_against_explicit_transfers_is_kept():
-    x = given()["x"]
-    with jax.transfer_guard("disallow_explicit"), pytest.raises(Exception, match="Disallowed host-to-device transfer"):
+@pytest.mark.parametrize(("guard", "x"), [("disallow", np.zeros((4, 3), np.float32)), ("disallow_explicit", given()["x"])])
+def test_guards_against_transfers_are_kept(guard, x):
+    """One still finds those of the caller, whose arrays of NumPy are his to move; one forbids explicit ones, too."""
+    with jax.transfer_guard(guard), pytest.raises(Exception, match="Disallowed host-to-device transfer"):
         jfrnn.count(x, CUTOFF)
 
 
