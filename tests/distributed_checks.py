@@ -6,11 +6,8 @@ compare with rational arithmetic.
 
 import dataclasses
 import functools
-import json
 import os
 import sys
-import time
-import traceback
 import warnings
 from pathlib import Path
 
@@ -20,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import soon
+from children import check, main
 
 import jfrnn
 from jfrnn import distributed
@@ -28,13 +26,7 @@ soon.compile_soon()
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 
-CHECKS = {}
 GUIDE = Path(__file__).parent.parent / "docs" / "guides" / "many-devices.md"
-
-
-def check(fn):
-    CHECKS[fn.__name__] = fn
-    return fn
 
 
 def mesh_of(*shape):
@@ -465,16 +457,6 @@ def wrong_arguments_are_named():
     raises(ValueError, "anew", distributed.count, roomy(particles), 0.1, halo=distributed.halo(particles))
 
 
-def main(names):
-    warnings.simplefilter("error")
-    for name in names or CHECKS:
-        wrong, before = None, time.process_time()
-        try:
-            CHECKS[name]()
-        except Exception:
-            wrong = traceback.format_exc()
-        print(json.dumps({"name": name, "wrong": wrong, "cpu_s": time.process_time() - before}), flush=True)
-
-
 if __name__ == "__main__":
+    warnings.simplefilter("error")
     main(sys.argv[1:])

@@ -204,33 +204,18 @@ def assert_close(found, expected):
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-11), found, expected)
 
 
-TWICE = ("images", "either")  # second derivatives of the others by hand
-ONCE = ("skewed images",)  # and of kinds that are like this one, sums, too
-SUMMED = [(name, False, True) for name in TWICE] + [(name, False, False) for name in ONCE]
-SUMMED += [("queries", True, False)]
-MORE = (
-    [("scatter", True, False)]
-    + [(name, False, True) for name in LISTS if name not in TWICE]
-    + [(name, True, True) for name in ("images", "scatter", "queries")]
-)
+WAYS = [(name, "kernels", True) for name in ("images", "either")]  # second derivatives of the others by hand
+WAYS += [("skewed images", "kernels", False), ("queries", "compensated", False), ("skewed images", "arrays", True)]
+MORE = [("scatter", "compensated", False), ("half mean", "arrays", False)]
+MORE += [(name, "compensated", True) for name in ("images", "scatter", "queries")]
+MORE += [each for each in product(LISTS, ("kernels", "arrays"), (True,)) if each not in WAYS]
 
 
-@pytest.mark.parametrize(("name", "compensated", "twice"), [*SUMMED, *slowly(*MORE)])
-def test_sums_and_derivatives(name, compensated, twice):
+@pytest.mark.parametrize(("name", "way", "twice"), [*WAYS, *slowly(*MORE)])
+def test_sums_and_derivatives(name, way, twice):
     """Of first order, and where kinds of lists differ in how pairs are passed on (`twice`) of second order."""
     nbrs, x, q = made(name)
-    found, sums = everything(nbrs, x, q, twice, compensated)
-    assert_pairs(name, nbrs, found, x, q)
-    assert_close(sums, expected_of(name, x, q, twice))
-
-
-@pytest.mark.parametrize(
-    ("name", "twice"),
-    [("skewed images", True), slow("half mean", False), *(slow(name, True) for name in LISTS if name != "skewed images")],
-)
-def test_array_programs_find_and_sum_the_same(name, twice):
-    nbrs, x, q = made(name)
-    found, sums = everything(by_arrays(nbrs), x, q, twice)
+    found, sums = everything(by_arrays(nbrs) if way == "arrays" else nbrs, x, q, twice, way == "compensated")
     assert_pairs(name, nbrs, found, x, q)
     assert_close(sums, expected_of(name, x, q, twice))
 

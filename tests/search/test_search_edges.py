@@ -6,10 +6,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
+from by_numpy import add_up, in_order, pull
 from checked import slow, slowly
 
 import jfrnn
-from jfrnn._engine.rows import add_up
+from jfrnn._engine.rows import add_up as add_up_rows
 
 LENGTHS = {"open": None, "nearest": [1.0, 1.0, 1.0], "images": [0.5, 0.3, 1.0]}
 N, CUTOFF = 60, 0.3
@@ -157,22 +158,14 @@ def test_sums_are_those_of_numpy(half):
 
         return jax.value_and_grad(f, (0, 1, 2))(x, m, lengths)
 
-    pairs = reference.reference_images(x, cutoff, matrix=lengths, periodic=(True,) * 3)
-    found = np.array([(i, j, *shift) for i, j, shift in pairs])
-    i, j, shift = found[:, 0], found[:, 1], found[:, 2:]
+    i, j, shift = pairs = in_order(reference.reference_images(x, cutoff, matrix=lengths, periodic=(True,) * 3), 3)
     assert (i == j).any()
     r = x[j] - x[i] + shift * lengths
-    each, pull = w[i] * m[i] * m[j] ** 2, 3 * (w[i] * m[i] * m[j] ** 2)[:, None] * r**2
-    cubes, slopes = (r**3).sum(1), [np.zeros((30, 3)), np.zeros(30), (pull * shift).sum(0)]
-    for k, sign in ((j, 1), (i, -1)):
-        np.add.at(slopes[0], k, sign * pull)
-    np.add.at(slopes[1], i, each / m[i] * cubes)
-    np.add.at(slopes[1], j, 2 * each / m[j] * cubes)
-    jax.tree.map(
-        lambda a, b: np.testing.assert_allclose(a, b, atol=1e-12 * np.abs(b).max()),
-        all_of(x, m, lengths, nbrs),
-        (each @ cubes, tuple(slopes)),
-    )
+    each, cubes = w[i] * m[i] * m[j] ** 2, (r**3).sum(1)
+    of_r, of_m = 3 * each[:, None] * r**2, add_up(each / m[i] * cubes, i, 30) + add_up(2 * each / m[j] * cubes, j, 30)
+    expected = each @ cubes, (pull(pairs, of_r, x), of_m, (of_r * shift).sum(0))
+    found = all_of(x, m, lengths, nbrs)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-12 * np.abs(b).max()), found, expected)
     if half:
         with pytest.raises(ValueError, match="must be a full list for reduce='max'"):
             jfrnn.pair_sum(lambda r, i, j: r, x, None, neighbors=nbrs, reduce="max")
@@ -251,8 +244,8 @@ def test_where_rows_begin_never_wraps():
     exact = np.concatenate([[0], np.cumsum(counts, dtype=np.int64)])
     wrapped = np.cumsum(counts, dtype=np.int32)
     assert (wrapped[exact[1:] >= 2**31] >= 0).any()
-    np.testing.assert_array_equal(jax.jit(add_up)(jnp.asarray(counts)), np.minimum(exact, 2**31 - 1))
-    np.testing.assert_array_equal(jax.jit(add_up)(jnp.asarray(counts[:3])), exact[:4])
+    np.testing.assert_array_equal(jax.jit(add_up_rows)(jnp.asarray(counts)), np.minimum(exact, 2**31 - 1))
+    np.testing.assert_array_equal(jax.jit(add_up_rows)(jnp.asarray(counts[:3])), exact[:4])
 
 
 @pytest.mark.parametrize(("backend", "include_self"), [("warp", False), *slowly(("warp", True), ("jax", False))])
