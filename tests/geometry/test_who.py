@@ -3,6 +3,7 @@
 import functools
 from itertools import product
 
+import by_numpy
 import checked
 import jax
 import jax.numpy as jnp
@@ -113,15 +114,10 @@ def test_a_box_per_system(backend):
 
 def slopes_of(pairs, x, q=None, box=None):
     """Return the sums of |r|^2 and the gradients of their total, by positions and by queries, in float64."""
-    x = np.asarray(x, np.float64)
+    x, pairs = np.asarray(x, np.float64), by_numpy.in_order(pairs, 3)
     q = x if q is None else np.asarray(q, np.float64)
-    sums, of_sources, of_rows = np.zeros(len(q)), np.zeros_like(x), np.zeros_like(q)
-    for i, j, shift in pairs:
-        r = x[j] - q[i] + np.array(shift) * (0 if box is None else box)
-        sums[i] += r @ r
-        of_sources[j] += 2 * r
-        of_rows[i] -= 2 * r
-    return sums, of_sources, of_rows
+    r = by_numpy.vectors_of(pairs, x, q, None if box is None else np.diag(box))
+    return by_numpy.add_up((r * r).sum(1), pairs.i, len(q)), *by_numpy.pull(pairs, 2 * r, x, q)
 
 
 def square(r, i, j):
@@ -406,13 +402,10 @@ def test_derivatives_leave_excluded_images_out(apart):
         given = {"queries": x[:7]} if apart else {}
         return (jfrnn.pair_sum(square, x, 0.5, exclude=exclude, box=jfrnn.Box(lengths), **given) ** 2).sum()
 
-    i, j, shift = (np.array(part) for part in zip(*left, strict=True))
-    r = x[j] - x[i] + shift * lengths
-    of_r = (4 * np.bincount(i, (r * r).sum(1))[i])[:, None] * r
-    expected = np.zeros_like(x)
-    np.add.at(expected, j, of_r)
-    np.add.at(expected, i, -of_r)
-    np.testing.assert_allclose(slopes(x), expected, rtol=1e-9, atol=1e-12)
+    left = by_numpy.in_order(left, 3)
+    r = by_numpy.vectors_of(left, x, x, np.diag(lengths))
+    of_r = (4 * np.bincount(left.i, (r * r).sum(1))[left.i])[:, None] * r
+    np.testing.assert_allclose(slopes(x), by_numpy.pull(left, of_r, x), rtol=1e-9, atol=1e-12)
 
 
 def test_excluded_images_traced_and_in_systems_of_their_own():
