@@ -10,7 +10,7 @@ import pytest
 import reference
 from by_numpy import in_order
 from checked import as_set, assert_same, padded, slow
-from test_box import LONG, energy_and_slopes, masked_images, unpacked
+from test_box import energy_and_slopes, masked_images, unpacked
 
 import jfrnn
 from jfrnn.cases.crystals import CRYSTAL_CASES
@@ -101,6 +101,7 @@ def assert_case(name, dtype, dim, backend, closed=False, half=False, geometry=Fa
     assert_same(masked_images(nbrs, x, **queries) if geometry else listed_images(nbrs, x, **queries), expected)
     assert int(np.asarray(nbrs.count).sum()) == len(expected) > 0
     assert nbrs.backend == backend
+    assert (box_of(given).numbers is None) == (name != "unreduced")
     assert (nbrs.images is None) == (name == "nearest")
 
 
@@ -216,36 +217,6 @@ def test_known_numbers_of_neighbors_at_long_cutoffs(backend):
     for i, count in enumerate(counts):  # no particle has another one twice in the same image
         listed = np.column_stack([np.asarray(nbrs.idx)[i], shifts[i]])[:count]
         assert len(np.unique(listed @ 1000 ** np.arange(4))) == count
-
-
-@pytest.mark.parametrize(
-    ("backend", "options"),
-    [slow("warp", {}), slow("warp", {"half": True}), slow("jax", {}), slow("jax", {"half": True}), slow("brute", {})],
-    ids=str,
-)
-def test_lattices_far_from_reduced(backend, options):
-    """Short vectors are found for each system that needs them, and are data: other boxes take the same program."""
-    rng, dtype, traces = np.random.default_rng(0), np.float32, []
-    batch = np.array([0] * 8 + [1] * 6 + [2] * 7)[rng.permutation(21)].astype(np.int32)
-    plain = np.array([[1.1, 0.0, 0.0], [0.2, 1.3, 0.0], [-0.1, 0.3, 1.2]])
-    slanted = np.array([[1.0, 0.0, 0.0], [0.1, 1.1, 0.0], [40.2, -27.1, 0.9]])
-
-    @jax.jit
-    def search(x, box):
-        traces.append(None)
-        return jfrnn.search(x, 0.6, box=box, batch=batch, capacity=64, backend=backend, **options)
-
-    for boxes in ([LONG, plain, slanted], [plain, LONG, LONG]):
-        boxes = np.stack(boxes).astype(dtype)
-        whole = rng.integers(-2, 3, (21, 3))
-        x = np.einsum("nd,ndk->nk", rng.uniform(0, 1, (21, 3)) + whole, boxes[batch]).astype(dtype)
-        nbrs = search(x, jfrnn.Box(boxes, images=2))
-        nbrs.check()
-        expected = oracle(boxes, x, batch, 0.6, **options)
-        assert masked_images(nbrs, x) == expected
-        assert int(nbrs.count.sum()) == len(expected) > 30
-    assert len(traces) == 1
-    assert jfrnn.Box([plain, plain]).numbers is None
 
 
 def test_one_program_serves_other_boxes_and_flags():

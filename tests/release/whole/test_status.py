@@ -50,7 +50,7 @@ KINDS = {"not finite": [Status.NONFINITE], "invalid": [bit for bit in SCENES if 
 
 def options(bit, traced):
     """Return positions, cutoff and other arguments of a search that sets a bit; those that only jit takes are left out outside."""
-    x, given, inside = SCENES[bit]
+    x, given, inside = SCENES.get(bit, (X, {"box": BOX}, {}))
     given = given | ({name: value + ZERO[0] for name, value in inside.items()} if traced else {})
     return x, given.get("cutoff", CUTOFF), {name: value for name, value in given.items() if name != "cutoff"}
 
@@ -130,13 +130,13 @@ def shared(make):
 @shared
 def made(bit, traced):
     x, cutoff, given = options(bit, traced)
-    return x, jfrnn.search(x, cutoff, capacity=256, **given)
+    return x, jfrnn.search(x, cutoff, capacity=2 if bit == Status.ROW_OVERFLOW else 256, **given)
 
 
 @shared
 def edges_made(bit, traced):
     x, cutoff, given = options(bit, traced)
-    return x, jfrnn.search_edges(x, cutoff, total=6000, **given)
+    return x, jfrnn.search_edges(x, cutoff, total=3 if bit == Status.ROW_OVERFLOW else 6000, **given)
 
 
 def lists(name, method, make=made):
@@ -172,8 +172,8 @@ def kept_pairs(nbrs, total):
 
 VERBS = dict(
     [
-        ("search", search_verb(functools.partial(jfrnn.search, capacity=256))),
-        ("search_edges", search_verb(functools.partial(jfrnn.search_edges, total=6000))),
+        lists("search", lambda x, nbrs: nbrs),
+        lists("search_edges", lambda x, nbrs: nbrs, edges_made),
         ("count", search_verb(jfrnn.count)),
         ("pair_sum, of floats", search_verb(functools.partial(jfrnn.pair_sum, one))),
         ("pair_sum, of integers", search_verb(functools.partial(jfrnn.pair_sum, whole))),
@@ -193,6 +193,7 @@ VERBS = dict(
         lists("NeighborList.to_jax_md", lambda x, nbrs: "what is listed" if nbrs.to_jax_md().idx is nbrs.idx else "other"),
     ]
 )
+OF_NO_LIST = ("count", "pair_sum, of floats", "pair_sum, of integers")
 OUTSIDE = dict(  # calls that are not for jit
     [
         lists("NeighborList.check, EdgeList.check", lambda x, nbrs: nbrs.check()),
@@ -228,30 +229,8 @@ def observed(every=False):
 
 def full_lists(traced):
     """Return a row of the table for each call on lists, and sums over them, whose rows, or whose total, overflowed."""
-    padded, flat = shared(lambda: jfrnn.search(X, CUTOFF, capacity=2)), shared(lambda: jfrnn.search_edges(X, CUTOFF, total=3))
-    makes = {
-        "search": padded,
-        "search_edges": flat,
-        "pair_sum(neighbors=), of floats": lambda: jfrnn.pair_sum(one, X, None, neighbors=padded()),
-        "pair_sum(neighbors=), of integers": lambda: jfrnn.pair_sum(whole, X, None, neighbors=padded()),
-        "pair_sum(neighbors=EdgeList)": lambda: jfrnn.pair_sum(one, X, None, neighbors=flat()),
-        "NeighborList.vectors": lambda: padded().vectors(X)[0],
-        "NeighborList.distances": lambda: padded().distances(X)[0],
-        "NeighborList.shifts": lambda: jfrnn.search(X, CUTOFF, capacity=2, box=BOX).shifts(X),
-        "NeighborList.edges": lambda: [(e := padded().edges(X, 6000)).displacement, e.distance],
-        "NeighborList.to_jraph": lambda: [(e := padded().to_jraph(X, 6000).edges)["displacement"], e["distance"]],
-        "EdgeList.edges": lambda: [(e := flat().edges(X)).displacement, e.distance],
-        "EdgeList.to_jraph": lambda: [(e := flat().to_jraph(X).edges)["displacement"], e["distance"]],
-        "NeighborList.update": lambda: padded().update(X),
-        "EdgeList.update": lambda: flat().update(X),
-        "NeighborList.pairs(total), csr(total)": lambda: kept_pairs(padded(), 6000),
-        "NeighborList.to_jax_md": lambda: "what is listed" if (n := padded()).to_jax_md().idx is n.idx else "other",
-        "NeighborList.check, EdgeList.check": lambda: padded().check(),
-        "NeighborList.pairs(), csr()": lambda: padded().pairs()[0],
-        "EdgeList.pairs()": lambda: flat().pairs()[0],
-        "NeighborList.grow, EdgeList.grow, run_chunk": lambda: grown(padded(), X),
-    }
-    return calls({name: make for name, make in makes.items() if not (traced and name in OUTSIDE)}, traced)
+    makes = {name: make for name, make in (VERBS if traced else VERBS | OUTSIDE).items() if name not in OF_NO_LIST}
+    return calls({name: functools.partial(make, Status.ROW_OVERFLOW, traced) for name, make in makes.items()}, traced)
 
 
 def others():
