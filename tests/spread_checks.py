@@ -57,8 +57,8 @@ def over_lists(x, r):
     return [jax.grad(energy)(x) for energy in energies]
 
 
-def near_walls(x, r):
-    tri = jfrnn.search_triangles(x, CORNERS, SIDES, 0.4, capacity=8)
+def near_walls(x, r, backend="auto"):
+    tri = jfrnn.search_triangles(x, CORNERS, SIDES, 0.4, capacity=8, backend=backend)
     return tri, tri.update(x)
 
 
@@ -68,6 +68,7 @@ QUICK = {
     "sum": summed,
     "lists": over_lists,
     "walls": near_walls,
+    "walls in cells": lambda x, r: near_walls(x, r, "warp"),
     "order": lambda x, r: jfrnn.sort_order(x, 0.5),
 }
 MORE = {
@@ -156,6 +157,8 @@ def moving(x, r, **options):
 def shard_map_as_it_is_by_itself():
     systems_of_devices(lambda x, r: (jfrnn.count(x, 0.5), *summed(x, r)))
     systems_of_devices(moving)
+    for backend in ("warp", "bvh"):
+        systems_of_devices(lambda x, r, backend=backend: [tri.idx for tri in near_walls(x, r, backend)])
 
 
 @check

@@ -95,37 +95,25 @@ def assert_case(name, dtype, dim, backend, *, closed=False, geometry=False, imag
 TIED = [name for name in PERIODIC_CASES if any(word in name for word in ("ties", "crystal", "cutoffs", "residues", "_supercell"))]
 # other axes than those of periodic_x, periodic_z, periodic_xz and periodic_yz, or of skewed_slab and skewed_wire, a program each
 RARE = ("periodic_y", "periodic_xy", "skewed_slab_first")
-
-
 OPTIMIZED = ("ties_across", "cutoff_1.5_boxes")  # nearest images, and several: kernels as users run them
 
 
-@pytest.mark.parametrize(
-    "name",
-    [pytest.param(x, marks=[pytest.mark.slow] * (x in RARE) + [pytest.mark.kernels] * (x in OPTIMIZED)) for x in PERIODIC_CASES],
-)
-def test_case(name):
-    assert_case(name, np.float32, 3, "warp", images=IMAGES.get(name))
+def each_case():
+    """Yield every case, kind, engine and comparison; by default each on Warp in one kind, whose programs they share, and few others."""
+    often = [(name, np.float64, 2, "warp", True) for name in TIED[::3]]
+    often += [("far_from_reduced_alone", np.float64, 2, "jax", False), ("cutoff_1_boxes", np.float32, 2, "brute", False)]
+    kinds = product((np.float32, np.float64), (2, 3), ("warp", "jax", "brute"), (False, True))
+    for (dtype, dim, backend, closed), name in product(kinds, PERIODIC_CASES):
+        each, shared = (name, dtype, dim, backend, closed), (dtype, dim, backend, closed) == (np.float32, 3, "warp", False)
+        by_default = each in often or (shared and name not in RARE)
+        kind = name if shared else f"{name}-f{8 * dtype().itemsize}-{dim}d-{backend}-{'closed' if closed else 'open'}"
+        marks = [pytest.mark.slow] * (not by_default) + [pytest.mark.kernels] * (shared and name in OPTIMIZED)
+        yield pytest.param(*each, not by_default, IMAGES.get(name) if shared else None, id=kind, marks=marks)
 
 
-@pytest.mark.parametrize("name", TIED[::3])
-def test_case_closed_in_float64(name):
-    assert_case(name, np.float64, 2, "warp", closed=True)
-
-
-@pytest.mark.parametrize(
-    ("name", "dtype", "backend"), [("far_from_reduced_alone", np.float64, "jax"), ("cutoff_1_boxes", np.float32, "brute")]
-)
-def test_case_of_other_engines(name, dtype, backend):
-    assert_case(name, dtype, 2, backend)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("closed", [False, True], ids=["open", "closed"])
-@pytest.mark.parametrize("name", PERIODIC_CASES)
-@pytest.mark.parametrize("backend", ["jax", "warp", "brute"])
-def test_every_case(name, dtype, dim, closed, backend):
-    assert_case(name, dtype, dim, backend, closed=closed, geometry=True)
+@pytest.mark.parametrize(("name", "dtype", "dim", "backend", "closed", "geometry", "images"), list(each_case()))
+def test_case(name, dtype, dim, backend, closed, geometry, images):
+    assert_case(name, dtype, dim, backend, closed=closed, geometry=geometry, images=images)
 
 
 # --- what boxes add to lists -----------------------------------------------------------------------------------------------

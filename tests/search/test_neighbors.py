@@ -108,8 +108,7 @@ def test_is_a_pytree_with_static_options(points):
 
 def test_refusals(points):
     nbrs = search(points, 0.4)
-    with pytest.raises(ValueError, match=r"positions hold 39 particles, but the list was made for 40"):
-        nbrs.distances(points[1:])
+
     with pytest.raises(ValueError, match="made without queries: leave queries out"):
         nbrs.vectors(points, queries=points)
     with pytest.raises(TypeError, match="positions must be float32 or float64"):
@@ -117,8 +116,7 @@ def test_refusals(points):
     asked = search(points, 0.4, queries=points[:3])
     with pytest.raises(ValueError, match="made with queries: pass queries="):
         asked.distances(points)
-    with pytest.raises(ValueError, match="queries hold 4 points, but the list was made for 3"):
-        asked.distances(points, queries=points[:4])
+
     with pytest.raises(TypeError, match=r"check\(\) reads values and cannot run inside jax.jit"):
         jax.jit(lambda x: jfrnn.search(x, 0.4, capacity=40).check())(points)
     batch = jax.vmap(lambda x: jfrnn.search(x, 0.4, capacity=40))(points[None])

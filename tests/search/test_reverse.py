@@ -254,14 +254,6 @@ def test_updates_keep_it(kind):
         assert_all_slots(each)
 
 
-@pytest.mark.parametrize("queries", [None, ASKING])
-def test_what_it_takes_is_planned(queries):
-    nbrs, *_ = make("full" if queries is None else "queries", "warp")
-    options = {"dtype": np.float64, "queries": queries, "skin": 0.05, "reverse": True, "backend": "warp"}
-    plan = jfrnn.memory_plan(N, CUTOFF, nbrs.capacity, **options)
-    assert plan.list_bytes == sum(leaf.nbytes for leaf in jax.tree.leaves(nbrs))
-
-
 @pytest.mark.parametrize("kind", ["full", "half", "queries"])
 def test_nobody(kind):
     x = jnp.zeros((0, 3))

@@ -285,7 +285,6 @@ def test_refusals(dim):
     nbrs = jfrnn.search(x, CUTOFF, skin=SKIN)
     with pytest.raises(ValueError, match="this list was made without active: leave active out"):
         nbrs.update(x, active=np.ones(10, bool))
-    with pytest.raises(ValueError, match="positions hold 9 particles, but the list was made for 10"):
-        nbrs.update(x[:9])
+
     with pytest.raises(ValueError, match="this list was made with active: pass active="):
         jfrnn.search(x, CUTOFF, active=np.ones(10, bool)).update(x)

@@ -1,6 +1,7 @@
 """Fused pair sums in periodic boxes, and with a cutoff per particle: the oracle's pairs and images, and derivatives."""
 
 import functools
+from itertools import product
 
 import checked
 import jax
@@ -8,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
-from checked import slow
+from checked import slow, sparing
 from marked import assert_compensated, assert_marks, cancelling, marks
 from test_pair_sum import CUTOFF, N, assert_same, everything, oracle, scene, smooth, smooth_slopes, tangents_of
 from test_radii import LENGTH, radii_of
@@ -45,15 +46,11 @@ def assert_case(name, dtype, dim, **options):
     assert_marks(found, pairs, given.positions, given.queries, given.matrix)
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_cases(name):
-    assert_case(name, np.float32, 3)
+EVERY = product(PERIODIC_CASES, (np.float32, np.float64), (2, 3))
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("dtype", "dim"), [(np.float32, 2), (np.float64, 2), (np.float32, 3), (np.float64, 3)])
-@pytest.mark.parametrize("name", PERIODIC_CASES)
-def test_every_case(name, dtype, dim):
+@pytest.mark.parametrize(("name", "dtype", "dim"), sparing(EVERY, [(name, np.float32, 3) for name in NAMES]))
+def test_cases(name, dtype, dim):
     assert_case(name, dtype, dim)
 
 

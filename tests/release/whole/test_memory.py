@@ -11,7 +11,7 @@ import jax
 import numpy as np
 import pytest
 import warp as wp
-from checked import slow
+from checked import slow, slowly
 from places import ROOT, TESTS
 
 import jfrnn
@@ -62,11 +62,12 @@ def test_a_flat_list_takes_what_was_planned(options):
 
 
 @pytest.mark.parametrize("queries", [None, 500])
-def test_what_a_list_with_a_skin_keeps_is_planned(queries, dtype):
-    plan = jfrnn.memory_plan(1000, 0.1, 8, dtype=dtype, queries=queries, skin=0.01, backend="warp")
+@pytest.mark.parametrize("reverse", [False, True])
+def test_what_a_list_with_a_skin_keeps_is_planned(queries, reverse, dtype):
+    options = {"skin": 0.01, "reverse": reverse, "backend": "warp"}
+    plan = jfrnn.memory_plan(1000, 0.1, 8, dtype=dtype, queries=queries, **options)
     x = np.random.default_rng(0).random((1000, 3)).astype(dtype)
-    asked = None if queries is None else x[:queries]
-    nbrs = jfrnn.search(x, 0.1, skin=0.01, capacity=8, queries=asked, backend="warp")
+    nbrs = jfrnn.search(x, 0.1, capacity=8, queries=None if queries is None else x[:queries], **options)
     assert plan.list_bytes == sum(leaf.nbytes for leaf in jax.tree.leaves(nbrs))
 
 
@@ -107,7 +108,11 @@ def test_few_particles_take_no_scratch_on_a_gpu():
 @pytest.mark.parametrize("backend", ["jax", slow("brute")])
 @pytest.mark.parametrize(
     ("n", "capacity", "dim", "dtype", "queries"),
-    [slow(1000, 40, 3, np.float32, None), (300_000, 256, 2, np.float64, None), slow(1000, 40, 2, np.float32, 30_000)],
+    [
+        *((300_000, 256, 2, np.float64, None), (4_000_000, 64, 3, np.float32, None)),
+        *slowly((1000, 40, 3, np.float32, None), (1000, 40, 2, np.float32, 30_000), (20_000, 64, 2, np.float32, None)),
+        *slowly((20_000, 20_000, 2, np.float64, None), (4_000_000, 64, 3, np.float64, None)),
+    ],
 )
 def test_compiled_engines_take_what_was_planned(n, capacity, dim, dtype, queries, backend):
     plan = jfrnn.memory_plan(n, 0.1, capacity, dim=dim, dtype=dtype, queries=queries, backend=backend)
