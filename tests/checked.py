@@ -29,6 +29,12 @@ def sparing(cases, often):
     return [case if case in often else slow(*case) for case in map(tuple, cases)]
 
 
+def refuses(error, match, call, /, *given, **options):
+    """Fail unless a call raises an error that says this."""
+    with pytest.raises(error, match=match):
+        call(*given, **options)
+
+
 @jaxtyped(typechecker=beartype)
 def assert_shapes(
     idx: Int32[Array, "m k"],

@@ -13,7 +13,7 @@ import checked
 import numpy as np
 import pytest
 import reference
-from checked import slow
+from checked import refuses, slow
 
 import jfrnn.ase
 import jfrnn.matscipy
@@ -182,8 +182,7 @@ BAD = {
 @pytest.mark.parametrize("message", BAD)
 def test_bad_input_says_what_is_wrong(message):
     given = {"quantities": "ij", "pbc": True, "cell": np.eye(3), "positions": np.zeros((2, 3)), "cutoff": 0.5} | BAD[message]
-    with pytest.raises((ValueError, TypeError), match=message):
-        primitive_neighbor_list(**given)
+    refuses((ValueError, TypeError), message, primitive_neighbor_list, **given)
 
 
 def test_what_is_no_structure_is_refused():
@@ -392,5 +391,4 @@ def test_names_of_ase_and_matscipy():
         (TypeError, "got a, positions", {"a": atoms, "positions": atoms.positions, "cutoff": 3.0}),
         (ValueError, "needs cell", {"positions": atoms.positions, "pbc": True, "cutoff": 3.0}),
     ):
-        with pytest.raises(error, match=match):
-            neighbor_list("i", **given)
+        refuses(error, match, neighbor_list, "i", **given)

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
-from checked import as_set, slots_as_set, slow, slowly, sparing
+from checked import as_set, refuses, slots_as_set, slow, slowly, sparing
 
 from jfrnn import jax_md
 
@@ -172,10 +172,8 @@ def test_boxes_that_change():
     assert update(x, nbrs, 0.4 * MATRIX).cell_size_too_small
     with pytest.raises(ValueError, match="box= only with fractional_coordinates=True"):
         jax_md.neighbor_list(None, LENGTHS, CUTOFF).allocate(points(False)).update(points(False), box=LENGTHS)
-    with pytest.raises(TypeError, match=r"update\(\) got perturbation"):
-        nbrs.update(x, perturbation=jnp.eye(3))
-    with pytest.raises(ValueError, match="displacement_or_metric given"):
-        jax_md.neighbor_list(None, 1.0, CUTOFF).allocate(x)
+    refuses(TypeError, r"update\(\) got perturbation", nbrs.update, x, perturbation=jnp.eye(3))
+    refuses(ValueError, "displacement_or_metric given", jax_md.neighbor_list(None, 1.0, CUTOFF).allocate, x)
     with pytest.raises(ValueError, match="format must be a member of NeighborListFormat"):
         jax_md.neighbor_list(None, 1.0, CUTOFF, format="Dense")
     with pytest.raises(TypeError, match=r"cannot run inside jax.jit"):
@@ -282,8 +280,7 @@ def test_several_images_by_jax_md_itself(dim, dtype):
     with jax.numpy_dtype_promotion("standard"):
         own = getattr(jax_md, "estimate_max_neighbors", None) and pytest.importorskip("jax_md").custom_partition
         if own is None:
-            with pytest.raises(TypeError, match=r"got \[12, \d\] and .*float\d\d: of others, install jax-md"):
-                fns.allocate(x)
+            refuses(TypeError, r"got \[12, \d\] and .*float\d\d: of others, install jax-md", fns.allocate, x)
             return
         made = own.neighbor_list_multi_image(None, 1.7 * jnp.eye(dim), 1.2, SKIN).allocate(x)
         for nbrs, other in ((fns.allocate(x), made), (fns.update(x + dtype(0.2), fns.allocate(x)), made.update(x + dtype(0.2)))):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import reference
 from by_numpy import in_order
-from checked import as_set, assert_same, padded, slow
+from checked import as_set, assert_same, padded, refuses, slow
 from test_box import energy_and_slopes, masked_images, unpacked
 
 import jfrnn
@@ -254,8 +254,7 @@ def test_numbers_without_a_box_are_told():
     x = jnp.zeros((3, 2))
     nbrs = jfrnn.search(x, 0.5, box=jfrnn.Box(np.ones((2, 2, 2)) + np.eye(2)), batch=np.array([0, 2, -1]), capacity=8)
     assert jfrnn.Status(int(nbrs.status)) == jfrnn.Status.SYSTEM_WITHOUT_BOX
-    with pytest.raises(ValueError, match="names systems for which `box` holds no box"):
-        nbrs.check()
+    refuses(ValueError, "names systems for which `box` holds no box", nbrs.check)
 
 
 X, SYSTEMS, CELLS = np.zeros((4, 3)), np.zeros(4, np.int32), np.stack([np.eye(3)] * 2)
@@ -291,8 +290,7 @@ X, SYSTEMS, CELLS = np.zeros((4, 3)), np.zeros(4, np.int32), np.stack([np.eye(3)
     ],
 )
 def test_errors(error, match, call):
-    with pytest.raises(error, match=match):
-        call()
+    refuses(error, match, call)
 
 
 def test_near_ties_of_particles_a_hundred_cells_away():

@@ -6,6 +6,7 @@ from collections import Counter
 import jax
 import numpy as np
 import pytest
+from checked import refuses
 
 import jfrnn
 from jfrnn.cases import meshes
@@ -113,14 +114,10 @@ def test_a_plate_is_a_sheet():
 
 
 def test_what_is_refused():
-    with pytest.raises(ValueError, match="inner must be below outer"):
-        meshes.pipe(1.0, 1.0)
-    with pytest.raises(ValueError, match="bore must be below"):
-        meshes.gear(20, 1000, bore=18.0)
-    with pytest.raises(ValueError, match="pressure_angle must lie"):
-        meshes.gear_outline(20, pressure_angle=45.0)
-    with pytest.raises(ValueError, match="teeth must lie"):
-        meshes.gear(4)
+    refuses(ValueError, "inner must be below outer", meshes.pipe, 1.0, 1.0)
+    refuses(ValueError, "bore must be below", meshes.gear, 20, 1000, bore=18.0)
+    refuses(ValueError, "pressure_angle must lie", meshes.gear_outline, 20, pressure_angle=45.0)
+    refuses(ValueError, "teeth must lie", meshes.gear, 4)
 
 
 def test_triangles_written_apart_hang_together_again(dtype):
@@ -157,8 +154,7 @@ def test_exactly_equal_corners_alone_are_one():
     ],
 )
 def test_what_is_no_mesh_is_refused(vertices, faces, error, match):
-    with pytest.raises(error, match=match):
-        jfrnn.merge_vertices(vertices, faces)
+    refuses(error, match, jfrnn.merge_vertices, vertices, faces)
 
 
 def test_it_does_not_run_while_tracing():

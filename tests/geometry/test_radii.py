@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
-from checked import slow, sparing
+from checked import refuses, slow, sparing
 from test_box import image_pairs, masked_images
 
 import jfrnn
@@ -167,8 +167,7 @@ def test_traced_radii_share_one_program_and_bad_ones_set_a_bit():
         assert jfrnn.Status(int(nbrs.status)) == jfrnn.Status.INVALID_CUTOFF
         assert nbrs.count[7] == 0
         assert {(i, j) for i, j in reference.pairs_of(nbrs.idx, nbrs.count, len(x))} == {pair for pair in expected if 7 not in pair}
-        with pytest.raises(ValueError, match="`cutoff` holds values that are negative or not finite"):
-            nbrs.check()
+        refuses(ValueError, "`cutoff` holds values that are negative or not finite", nbrs.check)
     assert len(traces) == 1
 
 
@@ -326,8 +325,7 @@ X, H = np.zeros((4, 3), np.float32), np.ones(4, np.float32)
     ],
 )
 def test_errors(error, match, make):
-    with pytest.raises(error, match=match):
-        make()
+    refuses(error, match, make)
 
 
 def test_known_cutoffs_are_read_while_positions_are_traced():

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
-from checked import slow, slowly
+from checked import refuses, slow, slowly
 from test_box import image_pairs
 
 import jfrnn
@@ -242,8 +242,7 @@ def test_what_is_traced_sets_bits():
     wrong[3] = N, 0
     nbrs = search(x, table, species, wrong)
     assert jfrnn.Status(int(nbrs.status)) == jfrnn.Status.EXCLUDED_OUT_OF_RANGE
-    with pytest.raises(ValueError, match="`exclude` names particles that do not exist"):
-        nbrs.check()
+    refuses(ValueError, "`exclude` names particles that do not exist", nbrs.check)
     lost, uneven = species.copy(), table.copy()
     lost[7], uneven[2, 1] = 3, 0.5
     nbrs = search(x, table, lost, pairs)
@@ -284,8 +283,7 @@ UNEVEN = np.array([[1.0, 0.5], [0.25, 1.0]], np.float32)
     ],
 )
 def test_errors(error, match, make):
-    with pytest.raises(error, match=match):
-        make()
+    refuses(error, match, make)
 
 
 def test_nobody_is_excluded_by_no_pairs():
@@ -427,8 +425,7 @@ def test_excluded_images_traced_and_in_systems_of_their_own():
     nbrs = search(exclude)
     nbrs.check()
     assert int(np.sum(nbrs.count)) == len(found - gone)
-    with pytest.raises(ValueError, match="exclude"):
-        search(exclude + 100).check()
+    refuses(ValueError, "exclude", search(exclude + 100).check)
     with pytest.raises(ValueError, match=r"shape \[e, 2\], a pair in each row, or \[e, 5\] with the lattice shift"):
         jfrnn.search(x, 0.6, exclude=exclude[:, :4])
     assert jax.make_jaxpr(lambda: jfrnn.count(x, 0.6, exclude=exclude[:, :2]))  # as before

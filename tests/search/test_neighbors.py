@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
+from checked import refuses
 
 import jfrnn
 
@@ -109,19 +110,15 @@ def test_is_a_pytree_with_static_options(points):
 def test_refusals(points):
     nbrs = search(points, 0.4)
 
-    with pytest.raises(ValueError, match="made without queries: leave queries out"):
-        nbrs.vectors(points, queries=points)
-    with pytest.raises(TypeError, match="positions must be float32 or float64"):
-        nbrs.vectors(points.astype(int))
+    refuses(ValueError, "made without queries: leave queries out", nbrs.vectors, points, queries=points)
+    refuses(TypeError, "positions must be float32 or float64", nbrs.vectors, points.astype(int))
     asked = search(points, 0.4, queries=points[:3])
-    with pytest.raises(ValueError, match="made with queries: pass queries="):
-        asked.distances(points)
+    refuses(ValueError, "made with queries: pass queries=", asked.distances, points)
 
     with pytest.raises(TypeError, match=r"check\(\) reads values and cannot run inside jax.jit"):
         jax.jit(lambda x: jfrnn.search(x, 0.4, capacity=40).check())(points)
     batch = jax.vmap(lambda x: jfrnn.search(x, 0.4, capacity=40))(points[None])
-    with pytest.raises(ValueError, match="index the batch first"):
-        batch.pairs()
+    refuses(ValueError, "index the batch first", batch.pairs)
 
 
 ASKED = {
@@ -146,8 +143,7 @@ def test_a_list_is_asked_about_what_it_was_made_of(asked, options):
     }
     for match, other in others.items():
         for call in (ASKED[asked], lambda nbrs, x: jax.eval_shape(lambda x: ASKED[asked](nbrs, x), x)):
-            with pytest.raises(ValueError, match=f"positions.*{match}"):
-                call(nbrs, other)
+            refuses(ValueError, f"positions.*{match}", call, nbrs, other)
     if not options:
         of_queries = jfrnn.search(x, 0.4, queries=x[:3], capacity=8, backend="warp")
         with pytest.raises(ValueError, match=r"queries must be float32 with 3 columns.*got float64"):
@@ -190,8 +186,7 @@ def test_boxes_and_totals_are_taken_by_place_and_by_name():
         assert same(lambda x, box, call=call: call(x, 500, box), lambda x, box, call=call: call(x, total=500, box=box))
     assert int(nbrs.grow(x, box, slack=1.5).status) == 0
     for made in (nbrs, flat):
-        with pytest.raises(TypeError, match=r"box must be a jfrnn\.Box"):
-            made.grow(x, x, slack=1.5)
+        refuses(TypeError, r"box must be a jfrnn\.Box", made.grow, x, x, slack=1.5)
         name = type(made).__name__
         for method in ("update", "grow", "edges"):
             with pytest.raises(TypeError, match=rf"^{name}\.{method}\(\) got an unexpected keyword argument 'boxes'"):
@@ -199,5 +194,4 @@ def test_boxes_and_totals_are_taken_by_place_and_by_name():
         assert type(made).update.__doc__.startswith("Rebuild the list")
     with pytest.raises(TypeError, match=r"^NeighborList\.pairs\(\) got an unexpected keyword argument 'position'"):
         nbrs.pairs(position=x)
-    with pytest.raises(TypeError, match=r"box must be a jfrnn\.Box, got float32 of shape \[20, 3\]"):
-        nbrs.distances(x, x)
+    refuses(TypeError, r"box must be a jfrnn\.Box, got float32 of shape \[20, 3\]", nbrs.distances, x, x)

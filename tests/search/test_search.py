@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import reference
 import soon
-from checked import slow
+from checked import refuses, slow
 
 import jfrnn
 
@@ -133,10 +133,8 @@ def test_overflow_sets_the_bit_and_keeps_true_counts(capacity, backend):
         with pytest.raises(jfrnn.NeighborOverflowError, match=f"capacity={required} or more") as error:
             nbrs.check()
         assert (error.value.required, error.value.capacity) == (required, capacity)
-        with pytest.raises(jfrnn.NeighborOverflowError, match="too small"):
-            nbrs.pairs()
-        with pytest.raises(jfrnn.NeighborOverflowError, match="too small"):
-            nbrs.csr()
+        refuses(jfrnn.NeighborOverflowError, "too small", nbrs.pairs)
+        refuses(jfrnn.NeighborOverflowError, "too small", nbrs.csr)
     kept = [set(row[: min(c, capacity)].tolist()) for row, c in zip(np.asarray(nbrs.idx), np.asarray(nbrs.count), strict=True)]
     true = [set(row[:c].tolist()) for row, c in zip(np.asarray(full.idx), np.asarray(full.count), strict=True)]
     assert all(k <= t and len(k) == min(len(t), capacity) for k, t in zip(kept, true, strict=True))
@@ -172,8 +170,7 @@ def test_non_finite_positions_set_a_bit_and_spare_the_others(value, backend, dty
     assert jfrnn.Status(int(nbrs.status)) == jfrnn.Status.NONFINITE
     checked.assert_exact(nbrs, points, 0.3, include_self=True)
     assert nbrs.count[17] == 0
-    with pytest.raises(ValueError, match="non-finite coordinates"):
-        nbrs.check()
+    refuses(ValueError, "non-finite coordinates", nbrs.check)
 
 
 @pytest.mark.parametrize("backend", ["warp", "hashgrid", "jax"])
@@ -182,15 +179,13 @@ def test_non_finite_queries_set_the_bit(backend):
     nbrs = jfrnn.search(points, 0.3, queries=queries, capacity=16, backend=backend)
     checked.assert_exact(nbrs, points, 0.3, queries=queries)
     assert jfrnn.Status(int(nbrs.status)) == jfrnn.Status.NONFINITE
-    with pytest.raises(ValueError, match="queries"):
-        nbrs.check()
+    refuses(ValueError, "queries", nbrs.check)
 
 
 def test_counts_that_are_not_known_raise_or_are_no_numbers():
     points = random_points(100, 3, np.float32)
     points[17, 2] = np.nan
-    with pytest.raises(ValueError, match=r"positions\[17\] is"):
-        jfrnn.count(points, 0.3)
+    refuses(ValueError, r"positions\[17\] is", jfrnn.count, points, 0.3)
     assert np.flatnonzero(np.asarray(jax.jit(lambda x: jfrnn.count(x, 0.3))(points)) < 0).tolist() == [17]
 
 
@@ -327,8 +322,7 @@ X = np.zeros((4, 3), np.float32)
 )
 def test_input_errors(error, match, arguments):
     arguments = {"positions": X, "cutoff": 1.0} | arguments
-    with pytest.raises(error, match=match):
-        jfrnn.search(arguments.pop("positions"), arguments.pop("cutoff"), **arguments)
+    refuses(error, match, jfrnn.search, arguments.pop("positions"), arguments.pop("cutoff"), **arguments)
 
 
 @pytest.mark.parametrize(
@@ -349,8 +343,7 @@ def test_input_errors(error, match, arguments):
     ],
 )
 def test_errors_under_jit(error, match, function):
-    with pytest.raises(error, match=match):
-        jax.jit(function)(X)
+    refuses(error, match, jax.jit(function), X)
 
 
 def test_float64_without_x64_is_refused():

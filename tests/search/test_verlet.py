@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
-from checked import slow, slowly
+from checked import refuses, slow, slowly
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -184,8 +184,7 @@ def test_overflow_is_sticky_and_grow_knows_what_it_takes():
     assert crowded.overflow
     assert back.overflow
     assert int(back.required) == int(crowded.required) == 59
-    with pytest.raises(jfrnn.NeighborOverflowError, match="one row has 59 neighbors"):
-        back.check()
+    refuses(jfrnn.NeighborOverflowError, "one row has 59 neighbors", back.check)
     grown = back.grow(x)
     assert grown.capacity >= 59
     assert not grown.overflow
@@ -240,8 +239,7 @@ def test_inactive_particles_have_no_neighbors_and_come_and_go(backend, dim):
     assert int(nbrs.rebuild_count) == 1
     assert masked_pairs(nbrs, jnp.asarray(x)) == reference.reference_pairs(x[:45], CUTOFF)
     nbrs.check()
-    with pytest.raises(ValueError, match="non-finite"):
-        nbrs.update(x, active=np.arange(60) < 51).check()
+    refuses(ValueError, "non-finite", nbrs.update(x, active=np.arange(60) < 51).check)
 
 
 def test_gradients_flow_around_updates():
@@ -270,10 +268,8 @@ def test_gradients_flow_around_updates():
 
 def test_refusals(dim):
     x = points(10, dim, np.float32)
-    with pytest.raises(ValueError, match=r"skin=-0.1 must be 0 \(no skin\) or between"):
-        jfrnn.search(x, CUTOFF, skin=-0.1)
-    with pytest.raises(ValueError, match="skin=nan must be 0"):
-        jfrnn.search(x, CUTOFF, skin=float("nan"))
+    refuses(ValueError, r"skin=-0.1 must be 0 \(no skin\) or between", jfrnn.search, x, CUTOFF, skin=-0.1)
+    refuses(ValueError, "skin=nan must be 0", jfrnn.search, x, CUTOFF, skin=float("nan"))
     with pytest.raises(TypeError, match="skin must be a number known while tracing, got str 'wide'"):
         jfrnn.search(x, CUTOFF, skin="wide")
     with pytest.raises(TypeError, match="skin must be a number known while tracing, got a traced value"):

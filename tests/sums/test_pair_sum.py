@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import reference
 from by_numpy import add_up, in_order
-from checked import slow, slowly
+from checked import refuses, slow, slowly
 from marked import assert_compensated, assert_marks, cancelling
 from marked import marks as marks_of_floats
 
@@ -764,8 +764,7 @@ def test_a_list_that_lacks_pairs_has_no_sums(half, reduce):
 
     assert all(np.isnan(found).all() for found in both(x, nbrs))
     for call in (sums, lambda nbrs, x: jax.jit(lambda x: sums(nbrs, x))(x)):
-        with pytest.raises(jfrnn.NeighborOverflowError, match="capacity=3 is too small"):
-            call(nbrs, x)
+        refuses(jfrnn.NeighborOverflowError, "capacity=3 is too small", call, nbrs, x)
     whole = nbrs.grow(x)
     i, j, _ = in_order(reference.reference_pairs(x, CUTOFF), 2)
     squares = ((np.asarray(x)[j] - np.asarray(x)[i]) ** 2).sum(1)
@@ -827,8 +826,7 @@ def listed(**options):
     ],
 )
 def test_errors(error, match, call):
-    with pytest.raises(error, match=match):
-        call()
+    refuses(error, match, call)
 
 
 @pytest.mark.parametrize("backend", ["warp", slow("jax")])

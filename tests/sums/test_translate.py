@@ -14,7 +14,7 @@ import sys
 import jax
 import numpy as np
 import pytest
-from checked import slow
+from checked import refuses, slow
 from jax import lax
 from jax import numpy as jnp
 from translated import Case, kernel_of, run
@@ -256,8 +256,7 @@ def test_cases_compile_for_cuda(real):
     ],
 )
 def test_what_has_no_translation(function, message):
-    with pytest.raises(NoTranslationError, match=message):
-        translated(function, np.ones(3))
+    refuses(NoTranslationError, message, translated, function, np.ones(3))
 
 
 def test_traced_constants_are_refused():
@@ -265,8 +264,7 @@ def test_traced_constants_are_refused():
         closed = jax.make_jaxpr(lambda y: x * y)(1.0)
         return _translate.translate(closed)
 
-    with pytest.raises(NoTranslationError, match="being traced: hand it over as an argument"):
-        jax.jit(outer)(1.0)
+    refuses(NoTranslationError, "being traced: hand it over as an argument", jax.jit(outer), 1.0)
 
 
 def test_inside_a_trace():

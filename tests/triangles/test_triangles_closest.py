@@ -167,18 +167,6 @@ def test_the_nearest_of_each_row_is_found_in_blocks_and_chunks(monkeypatch):
     assert np.array_equal(slot[some], np.where(mask, distance, np.inf).argmin(axis=1)[some])
 
 
-def test_signed_distance_in_2d():
-    vertices, faces = meshes.circle(1.0, 64)
-    x = np.random.default_rng(1).uniform(-1.4, 1.4, (200, 2))
-    tri = jfrnn.search_triangles(x, vertices, faces, 0.5, capacity=72)
-    signed = tri.signed_distance(x)
-    assert signed.watertight
-    rough = np.linalg.norm(x, axis=1) - 1
-    sure = np.asarray(signed.mask) & (np.abs(rough) > 2e-3)
-    assert sure.sum() > 50
-    assert np.array_equal(np.sign(signed.distance)[sure], np.sign(rough)[sure])
-
-
 @pytest.mark.parametrize("mesh", [meshes.circle(1.0, 8), meshes.cube(2.0, 2)], ids=["2d", "3d"])
 @pytest.mark.parametrize("closed", [is_closed, jax.jit(is_closed)], ids=["known", "traced"])
 def test_meshes_that_are_not_closed_are_told(mesh, closed):
