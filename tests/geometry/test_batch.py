@@ -149,11 +149,7 @@ PAIR = {"queries": X[:2]}
         (TypeError, "batch must be an array of integers.*got set", {"batch": {0, 1}}),
         (ValueError, r"batch must have shape \[4\], the system of each particle, got shape \[3\]", {"batch": SYSTEMS[:3]}),
         (ValueError, r"batch holds numbers from 0 to 4294967296", {"batch": np.array([0, 1, 2, 2**32])}),
-        (
-            ValueError,
-            r"batch must be a pair of arrays, of the positions \[4\] and of the queries \[2\]",
-            {"batch": SYSTEMS, **PAIR},
-        ),
+        (ValueError, r"batch must be a pair of arrays.* positions \[4\] and of the queries \[2\]", {"batch": SYSTEMS, **PAIR}),
         (ValueError, r"batch\[1\] must have shape \[2\], the system of each query", {"batch": (SYSTEMS, SYSTEMS), **PAIR}),
         (ValueError, "backend='hashgrid' knows one system at a time: pass", {"batch": SYSTEMS, "backend": "hashgrid"}),
     ],

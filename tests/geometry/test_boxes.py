@@ -271,22 +271,14 @@ X, SYSTEMS, CELLS = np.zeros((4, 3)), np.zeros(4, np.int32), np.stack([np.eye(3)
         (ValueError, r"origin must be a number or have shape \[3\] or \[2, 3\]", lambda: jfrnn.Box(CELLS, origin=np.zeros((3, 3)))),
         (ValueError, r"independent, got the rows .* in system 1", lambda: jfrnn.Box(CELLS * [[[1.0]], [[0.0]]])),
         (ValueError, r"must be finite, got .* in system 0", lambda: jfrnn.Box(CELLS * [[[np.nan]], [[1.0]]])),
-        (
-            ValueError,
-            r"must be positive, got \[-1.0, 1.0\] in system 1",
-            lambda: jfrnn.Box([[1.0, 1.0], [-1.0, 1.0]], per_system=True),
-        ),
+        (ValueError, r"must be positive, got \[-1.0, 1.0\] in system 1", lambda: jfrnn.Box([[1.0, 1], [-1, 1]], per_system=True)),
         (ValueError, "a box per system: pass batch=", lambda: jfrnn.search(X, 1.0, box=jfrnn.Box(CELLS))),
         (
             ValueError,
             r"kind with which the list was made \(.*for each of 2 systems\), got .*for each of 1 systems",
             lambda: jfrnn.search(X, 0.1, box=jfrnn.Box(CELLS), batch=SYSTEMS, capacity=8).update(X, box=jfrnn.Box(CELLS[:1])),
         ),
-        (
-            ValueError,
-            "hashgrid. knows one system at a time",
-            lambda: jfrnn.count(X, 1.0, box=jfrnn.Box(CELLS), batch=SYSTEMS, backend="hashgrid"),
-        ),
+        (ValueError, "hashgrid.*one system", lambda: jfrnn.count(X, 1.0, box=jfrnn.Box(CELLS), batch=SYSTEMS, backend="hashgrid")),
     ],
 )
 def test_errors(error, match, call):

@@ -305,11 +305,7 @@ X, H = np.zeros((4, 3), np.float32), np.ones(4, np.float32)
     ("error", "match", "make"),
     [
         (ValueError, r"radius_rule must be one of 'gather'.*got 'total'", lambda: jfrnn.search(X, H, radius_rule="total")),
-        (
-            ValueError,
-            r"cutoff must be a number, or have shape \[4\], one per particle, got shape \[3\]",
-            lambda: jfrnn.search(X, H[:3]),
-        ),
+        (ValueError, r"cutoff must be a number, or have shape \[4\], one per particle.*\[3\]", lambda: jfrnn.search(X, H[:3])),
         (TypeError, "cutoff must be a number, or an array of floats with one per particle", lambda: jfrnn.search(X, H.astype(int))),
         (TypeError, "cutoff must be a number, got str", lambda: jfrnn.search(X, "far")),
         (ValueError, r"cutoff must be a number, or have shape \[2\], one per query", lambda: jfrnn.search(X, H, queries=X[:2])),

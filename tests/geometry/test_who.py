@@ -262,11 +262,7 @@ UNEVEN = np.array([[1.0, 0.5], [0.25, 1.0]], np.float32)
     [
         (TypeError, "exclude must be an array of integers.*got float32", lambda: jfrnn.search(X, 1.0, exclude=T)),
         (ValueError, r"exclude must have shape \[e, 2\].*pairs_of_rows", lambda: jfrnn.search(X, 1.0, exclude=S)),
-        (
-            ValueError,
-            r"below 4, or -1 in padding, got \[0, 4\] in row 1",
-            lambda: jfrnn.search(X, 1.0, exclude=np.array([[0, 1], [0, 4]])),
-        ),
+        (ValueError, r"below 4, or -1 in padding, got \[0, 4\] in row 1", lambda: jfrnn.search(X, 1.0, exclude=[[0, 1], [0, 4]])),
         (ValueError, r"got \[-2, 0\] in row 0", lambda: jfrnn.count(X, 1.0, exclude=np.array([[-2, 0]]))),
         (ValueError, "numbers of queries below 1, then", lambda: jfrnn.count(X, 1.0, queries=X[:1], exclude=np.array([[1, 0]]))),
         (ValueError, "'hashgrid' cannot exclude pairs: pass", lambda: jfrnn.count(X, 1.0, exclude=S[None, :2], backend="hashgrid")),

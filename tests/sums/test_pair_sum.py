@@ -774,11 +774,17 @@ def test_a_list_that_lacks_pairs_has_no_sums(half, reduce):
 
 
 X, Q, M = np.zeros((4, 2), np.float32), np.ones((3, 2), np.float32), np.ones(4, np.float32)
-pair_sum = functools.partial(jfrnn.pair_sum, lambda r, i, j: r, X, 1.0)
 
 
-def listed(**options):
-    return jfrnn.search(X, 1.0, capacity=4, backend="warp", **options)
+def same(r, i, j):
+    return r
+
+
+def listed(x=X, **options):
+    return jfrnn.search(x, 1.0, capacity=4, backend="warp", **options)
+
+
+pair_sum = functools.partial(jfrnn.pair_sum, same, X, 1.0)
 
 
 @pytest.mark.parametrize(
@@ -792,11 +798,7 @@ def listed(**options):
         (ValueError, "reduce must be one of 'sum', 'max', 'min', got 'mean'", lambda: pair_sum(reduce="mean")),
         (ValueError, "symmetry must be None, 'symmetric' or", lambda: pair_sum(symmetry="odd")),
         (ValueError, "symmetry='symmetric' is about pairs without direction", lambda: pair_sum(symmetry="symmetric", queries=Q)),
-        (
-            ValueError,
-            "symmetry='symmetric' is about pairs without direction",
-            lambda: jfrnn.pair_sum(lambda r, i, j: r, X, M, symmetry="symmetric"),
-        ),
+        (ValueError, "symmetric' is about pairs without direction", lambda: jfrnn.pair_sum(same, X, M, symmetry="symmetric")),
         (TypeError, "compensated must be True or False", lambda: pair_sum(compensated=1)),
         (ValueError, "backend='hashgrid' cannot sum over pairs", lambda: pair_sum(backend="hashgrid")),
         (ValueError, "backend must be one of", lambda: pair_sum(backend="numpy")),
@@ -814,11 +816,7 @@ def listed(**options):
             "cutoff must be None or at most that of the list, which has cutoff=1.0, got 2.0",
             lambda: jfrnn.pair_sum(lambda r, i, j: r, X, 2.0, neighbors=listed()),
         ),
-        (
-            ValueError,
-            "positions hold 4 particles, but the list was made for 3",
-            lambda: pair_sum(neighbors=jfrnn.search(X[:3], 1.0, capacity=4, backend="warp")),
-        ),
+        (ValueError, "positions hold 4 particles, but the list was made for 3", lambda: pair_sum(neighbors=listed(X[:3]))),
         (ValueError, "made without queries", lambda: pair_sum(neighbors=listed(), queries=Q)),
         (ValueError, "made without a periodic box", lambda: pair_sum(neighbors=listed(), box=jfrnn.Box([3.0, 3.0]))),
         (ValueError, "neighbors must be a full list for reduce='max'", lambda: pair_sum(neighbors=listed(half=True), reduce="max")),

@@ -249,10 +249,7 @@ def test_cases_compile_for_cuda(real):
         (lambda x: x.astype(jnp.float16), "dtype float16.*backend"),
         (lambda x: x.astype(int) ** x.astype(int), "no translation"),
         (lambda x: jnp.concatenate([x] * 86).sum(), r"shape \(258,\).*256.*backend"),
-        (
-            lambda x: functools.reduce(lambda m, k: jnp.sin(m + k), range(100), jnp.outer(x, jnp.arange(80.0))),
-            "more than 20000.*backend",
-        ),
+        (lambda x: functools.reduce(lambda m, k: jnp.sin(m + k), range(100), jnp.outer(x, jnp.arange(80.0))), "20000.*backend"),
     ],
 )
 def test_what_has_no_translation(function, message):
