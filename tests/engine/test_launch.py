@@ -198,13 +198,8 @@ def test_launches_get_numbers_of_the_plan_and_addresses_of_the_call(native):
 
 
 def test_what_may_run_beside_the_one_before_waits_for_what_came_before_both(native):
-    steps = [
-        native.step(1),
-        native.step(2, numbers={"number": 2}),
-        native.step(3, numbers={"number": 3}, beside=True),
-        native.step(4),
-    ]
-    native.keep("beside@", 0, Plan(steps, {"number": 1}))
+    numbered = native.step(2, numbers={"number": 2}), native.step(3, numbers={"number": 3}, beside=True)
+    native.keep("beside@", 0, Plan([native.step(1), *numbered, native.step(4)], {"number": 1}))
     assert native.call("beside@", 1000) is None
     both = [launched(99, 1000, 2, 1), launched(7, 1000, 3, 1)]
     before, after = [(RECORD, 99, 71, 0), (WAIT, 7, 71, 0)], [(RECORD, 7, 72, 0), (WAIT, 99, 72, 0)]

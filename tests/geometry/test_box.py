@@ -131,10 +131,8 @@ def oracle(x, cutoff, vectors, periodic=(True,) * 3, **options):
 
 
 HALF, SELF = {"half": True}, {"include_self": True}
-OFTEN = [
-    *((np.float32, vectors, options) for vectors in ("nearest", "images") for options in (HALF, HALF | SELF)),
-    (np.float64, "images", SELF),
-]
+OFTEN = [(np.float32, vectors, options) for vectors in ("nearest", "images") for options in (HALF, HALF | SELF)]
+OFTEN += [(np.float64, "images", SELF)]
 ALL = product((np.float32, np.float64), ("nearest", "images"), (HALF, SELF, HALF | SELF))
 
 

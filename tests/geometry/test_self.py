@@ -82,13 +82,8 @@ def one(r, i, j):
 def test_everyone_is_its_own_neighbor(who, kind, backend, dtype, parts):
     x, cutoff, more = scene(who, dtype)
     batch = np.arange(N, dtype=np.int32) % 2
-    given = {
-        "box": BOXES[kind],
-        "include_self": True,
-        "backend": backend,
-        **more,
-        **({"batch": batch} if kind == "systems" else {}),
-    }
+    given = {"box": BOXES[kind], "include_self": True, "backend": backend} | more
+    given |= {"batch": batch} if kind == "systems" else {}
     expected = each_pair(who, x, cutoff, more, kind, batch, False)
     counts, total = np.bincount([i for i, *_ in expected], minlength=N), len(expected)
 

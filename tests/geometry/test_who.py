@@ -362,12 +362,8 @@ def test_excluded_images(lattice, kind, backend, dtype, summed):
         own = lambda pair: pair[0] < pair[1] or (pair[0] == pair[1] and pair[2] > (0, 0, 0))  # noqa: E731
     gone = set(picked) | {(j, i, tuple(-s for s in shift)) for i, j, shift in picked}
     if kind == "queries":
-        queries = {"queries": x[:10]}
-        all_pairs, gone, exclude = (
-            reference.reference_images(x, cutoff, queries=x[:10], **options),
-            set(picked),
-            exclude[exclude[:, 0] < 10],
-        )
+        queries, gone, exclude = {"queries": x[:10]}, set(picked), exclude[exclude[:, 0] < 10]
+        all_pairs = reference.reference_images(x, cutoff, **queries, **options)
     expected = {pair for pair in set(all_pairs) - gone if own(pair)}
     assert len(expected) < sum(map(own, all_pairs))
     nbrs = jfrnn.search(x, radii, exclude=exclude, capacity=96, **more, **queries)

@@ -123,12 +123,8 @@ def test_nothing_is_near_nothing(dtype, dim):
     empty, faces = np.zeros((0, dim), dtype), np.zeros((0, dim), np.int64)
     points, corners = np.zeros((2, dim), dtype), np.eye(dim, dtype=dtype)
     search = functools.partial(jfrnn.search_triangles, cutoff=1.0)
-    for x, v, f in (
-        (empty, empty, faces),
-        (points, empty, faces),
-        (points, corners, faces),
-        (empty, corners, np.arange(dim)[None]),
-    ):
+    without = ((empty, empty, faces), (points, empty, faces), (points, corners, faces))
+    for x, v, f in (*without, (empty, corners, np.arange(dim)[None])):
         tri = search(x, v, f)
         tri.check()
         assert tri.idx.shape == (len(x), 8)

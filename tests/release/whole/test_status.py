@@ -238,21 +238,12 @@ def others():
     corners, faces = PLATE
     lost, torn = corners.copy(), faces.copy()
     lost[3], torn[1] = np.nan, [0, 1, 9]
-    walls = {
-        "few slots": (corners, faces, 1),
-        "a corner that is not finite": (lost, faces, 2),
-        "a face of no corners": (corners, torn, 2),
-    }
-    x = np.abs(X) * np.float32(0.1)
-    table = {}
-    for vertices, named, capacity in walls.values():
+    x, table = np.abs(X) * np.float32(0.1), {}
+    for vertices, named, capacity in ((corners, faces, 1), (lost, faces, 2), (corners, torn, 2)):  # the first has few slots
         for traced in (False, True):
             tri = shared(functools.partial(jfrnn.search_triangles, x, vertices, named, 1.0, capacity=capacity))
-            made = {"search_triangles": tri, "closest": lambda tri=tri: tri().closest(x)[1]}
-            made |= {
-                "contacts": lambda tri=tri: tri().contacts(x)[1],
-                "signed_distance": lambda tri=tri: tri().signed_distance(x).distance,
-            }
+            made = {"search_triangles": tri, "signed_distance": lambda tri=tri: tri().signed_distance(x).distance}
+            made |= {"closest": lambda tri=tri: tri().closest(x)[1], "contacts": lambda tri=tri: tri().contacts(x)[1]}
             for name, said in calls(made, traced).items():
                 table.setdefault(name, []).append(said)
     return table
