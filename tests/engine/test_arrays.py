@@ -22,7 +22,6 @@ ELSEWHERE = tuning.ACCELERATOR._replace(words=1 << 12, few_pairs=1000, plain_pai
 AT_ONCE = ELSEWHERE._replace(words=1 << 20, few_pairs=1 << 20, plain_pairs=1 << 20)  # all rows and their doubtful pairs
 LOOPS = ELSEWHERE._replace(at_once=0)  # as blocks of many queries are processed
 TIES = ("ulp_far_axis", "queries_fewer")
-SLOW = pytest.mark.slow
 
 
 @pytest.fixture

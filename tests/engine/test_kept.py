@@ -149,10 +149,6 @@ RNG = np.random.default_rng(1)
 VALUES = {"m": RNG.random(N), "v": RNG.random((N, 3)), "k": np.arange(N, dtype=np.int32)}
 
 
-def energy_of(sums, sin=jnp.sin):
-    return (sums["a"] ** 2).sum() + sin(sums["b"]).sum()
-
-
 def everything(nbrs, x, q, twice, compensated=False):
     """Return displacements, the mask, and sums with their derivatives: of first order, and (`twice`) those along a motion, too."""
     mine = None if q is None else {"m": VALUES["m"][:ASKING]}
@@ -162,7 +158,7 @@ def everything(nbrs, x, q, twice, compensated=False):
             lambda r, i, j: {key: scale * y if key != "c" else y.astype(r.dtype) for key, y in summand(r, i, j).items()},
             x, None, {**VALUES, "m": m}, neighbors=nbrs, queries=q, query_values=mine, compensated=compensated,
         )  # fmt: skip
-        return energy_of(sums), sums
+        return (sums["a"] ** 2).sum() + jnp.sin(sums["b"]).sum(), sums
 
     @jax.jit
     def all_of(x, m, scale, q):
@@ -200,10 +196,6 @@ def expected_of(name, x, q, twice):
     return (slopes(x), by_numpy.along(slopes, x, np.cos(x))) if twice else slopes(x)
 
 
-def assert_close(found, expected):
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-11), found, expected)
-
-
 WAYS = [(name, "kernels", True) for name in ("images", "either")]  # second derivatives of the others by hand
 WAYS += [("skewed images", "kernels", False), ("queries", "compensated", False), ("skewed images", "arrays", True)]
 MORE = [("scatter", "compensated", False), ("half mean", "arrays", False)]
@@ -217,7 +209,8 @@ def test_sums_and_derivatives(name, way, twice):
     nbrs, x, q = made(name)
     found, sums = everything(by_arrays(nbrs) if way == "arrays" else nbrs, x, q, twice, way == "compensated")
     assert_pairs(name, nbrs, found, x, q)
-    assert_close(sums, expected_of(name, x, q, twice))
+    expected = expected_of(name, x, q, twice)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-11), sums, expected)
 
 
 @pytest.mark.parametrize(

@@ -21,11 +21,6 @@ def oracle(x, cutoff, box, **options):
     return reference.reference_images(np.asarray(x), cutoff, matrix=rows, periodic=box.periodic, **options)
 
 
-def rows_of(box):
-    rows = np.asarray(box.vectors, np.float64)
-    return np.diag(rows) if rows.ndim == 1 else rows
-
-
 @pytest.mark.parametrize("dtype", [np.float32, slow(np.float64)])
 @pytest.mark.parametrize("backend", ["warp", slow("jax")])
 def test_positions_that_are_wrapped_in_every_step_cost_no_lists(backend, dtype):
@@ -71,7 +66,8 @@ ALL = [(dtype, kind, asked) for dtype in (np.float32, np.float64) for kind in KI
 @pytest.mark.parametrize(("dtype", "kind", "asked"), [*EACH, *(slow(*x) for x in ALL if x not in EACH)])
 def test_images_of_a_kept_list_are_those_of_the_moved_particles(dtype, kind, asked):
     box, cutoff = KINDS[kind]
-    rng, skin, rows = np.random.default_rng(1), 0.1, rows_of(box)
+    rng, skin, rows = np.random.default_rng(1), 0.1, np.asarray(box.vectors, np.float64)
+    rows = np.diag(rows) if rows.ndim == 1 else rows
     whole = lambda size, most: (rng.integers(-most, most + 1, (size, 3)) * box.periodic) @ rows  # noqa: E731
     before = (rng.uniform(0, 1, (24, 3)) @ rows + whole(24, 2)).astype(dtype)
     points = None if asked != "queries" else (rng.uniform(0, 1, (9, 3)) @ rows + whole(9, 2)).astype(dtype)

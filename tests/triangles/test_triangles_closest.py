@@ -41,7 +41,7 @@ def test_distances_are_those_of_the_oracle(name, dtype, dim):
     given, eps = TRIANGLE_CASES[name].build(dtype, dim), float(np.finfo(dtype).eps)
     near = reference.triangle_pairs(given.positions, given.vertices, given.faces, given.cutoff)
     points, corners = np.zeros((PAIRS, dim), dtype), np.zeros((PAIRS, dim, dim), dtype)
-    pairs = random_part(near, PAIRS)
+    pairs = [sorted(near)[k] for k in sorted(np.random.default_rng(0).permutation(len(near))[:PAIRS])]
     points[: len(pairs)] = [given.positions[i] for i, _ in pairs]
     corners[: len(pairs)] = [given.vertices[given.faces[t]] for _, t in pairs]
     nearest, _, distance = map(np.asarray, _nearest(points, corners))
@@ -50,12 +50,6 @@ def test_distances_are_those_of_the_oracle(name, dtype, dim):
         assert abs(far - exact) <= 4 * eps * size
         apart = np.linalg.norm((here.astype(float) - point) / given.cutoff) * given.cutoff
         assert abs(apart - exact) <= 4 * eps * (size + float(np.max(np.abs(point))))
-
-
-def random_part(pairs, most):
-    """Return pairs, sorted; of more than so many a random part."""
-    pairs = sorted(pairs)
-    return [pairs[k] for k in sorted(np.random.default_rng(0).permutation(len(pairs))[:most])]
 
 
 @pytest.mark.parametrize(

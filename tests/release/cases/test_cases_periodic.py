@@ -52,10 +52,6 @@ def cells_of(given):
     return np.linalg.solve(rows_of(given).T.astype(float), given.positions.T.astype(float)).T
 
 
-def heights_of(given):
-    return 1 / np.linalg.norm(np.linalg.inv(rows_of(given).astype(float)), axis=0)
-
-
 def float_steps(value, dtype, steps):
     """The float so many floats above a value of that dtype."""
     for _ in range(abs(steps)):
@@ -63,14 +59,11 @@ def float_steps(value, dtype, steps):
     return float(value)
 
 
-def exact_vector(given, i, j, shift):
-    asking = given.positions if given.queries is None else given.queries
-    ends = zip(asking[i].tolist(), given.positions[j].tolist(), rows_of(given).T.tolist(), strict=True)
-    return [Fraction(b) - Fraction(a) + sum(s * Fraction(x) for s, x in zip(shift, column, strict=True)) for a, b, column in ends]
-
-
 def exact_squared(given, image):
-    return sum(v**2 for v in exact_vector(given, *image))
+    (i, j, shift), asking = image, given.positions if given.queries is None else given.queries
+    ends = zip(asking[i].tolist(), given.positions[j].tolist(), rows_of(given).T.tolist(), strict=True)
+    moved = ((Fraction(b) - Fraction(a), zip(shift, column, strict=True)) for a, b, column in ends)
+    return sum((apart + sum(s * Fraction(x) for s, x in steps)) ** 2 for apart, steps in moved)
 
 
 # Every case
@@ -256,8 +249,8 @@ def test_cells_are_skewed_as_said(dtype, dim):
         given = built(name, dtype, dim)
         rows = rows_of(given).astype(float)
         lengths = np.linalg.norm(rows, axis=1)
-        cosine = rows[0] @ rows[1] / (lengths[0] * lengths[1])
-        return np.sign(np.linalg.det(rows)), lengths / given.cutoff, heights_of(given) / given.cutoff, np.arccos(cosine)
+        cosine, heights = rows[0] @ rows[1] / (lengths[0] * lengths[1]), 1 / np.linalg.norm(np.linalg.inv(rows), axis=0)
+        return np.sign(np.linalg.det(rows)), lengths / given.cutoff, heights / given.cutoff, np.arccos(cosine)
 
     for tilt in ("0.3", "0.5", "1", "3", "-0.5"):
         rows = built(f"skewed_{tilt}", dtype, dim).matrix

@@ -40,11 +40,6 @@ def test_interrupted_searches_are_right_or_raise(tries, more):
     assert min(found["interrupted"], found["finished"]) > tries  # it was raised within searches, and behind them
 
 
-def forget_plans():
-    for key in list(launch._plans):
-        launch._open().drop(launch._plans.pop(key))
-
-
 @pytest.mark.parametrize("backend", ["warp", "hashgrid"])
 def test_what_a_handler_raises_while_python_is_asked_is_raised_when_the_call_has_ended(backend, monkeypatch):
     """A program whose plan is gone asks on the main thread."""
@@ -62,7 +57,8 @@ def test_what_a_handler_raises_while_python_is_asked_is_raised_when_the_call_has
         raise error
 
     error = KeyboardInterrupt("itself")
-    forget_plans()
+    for key in list(launch._plans):
+        launch._open().drop(launch._plans.pop(key))
     monkeypatch.setattr(launch, "_keep_plan", interrupted)
     before = signal.signal(signal.SIGUSR1, handle)
     try:
