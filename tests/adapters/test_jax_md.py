@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
-from checked import as_set, refuses, slots_as_set, slow, slowly, sparing
+from checked import as_set, refuses, slots_as_set, slow, sparing
 
 from jfrnn import jax_md
 
@@ -93,15 +93,10 @@ def test_pairs_in_a_loop(space, form):
     np.testing.assert_array_equal(still.reference_position, x)
 
 
-@pytest.mark.parametrize(
-    ("form", "euclidean"),
-    [
-        (jax_md.Dense, False),
-        (jax_md.Sparse, True),
-        *slowly((jax_md.Dense, True), (jax_md.Sparse, False)),
-        *(slow(jax_md.OrderedSparse, each) for each in (True, False)),
-    ],
-)
+MEASURED = [(jax_md.Dense, False), (jax_md.Sparse, True)]
+
+
+@pytest.mark.parametrize(("form", "euclidean"), sparing(itertools.product(FORMATS, (True, False)), MEASURED))
 def test_what_is_no_space_of_ours_is_measured(form, euclidean):
     """A distance that is not Euclidean, or a box that is too small for its nearest images."""
     displacement, box = (functools.partial(nearest, box=np.float64(1.0)), 1.0) if euclidean else (metric, 2.0)
@@ -238,13 +233,7 @@ def test_the_function_chooses(displacement):
 IMAGES_OFTEN = [(jax_md.Dense, True)]  # pairs one after another, and no fractions: of particles that nobody wrapped
 
 
-@pytest.mark.parametrize(
-    ("form", "fractional"),
-    [
-        pytest.param(form, fractional, marks=[pytest.mark.slow] * ((form, fractional) not in IMAGES_OFTEN))
-        for form, fractional in itertools.product(FORMATS, (True, False))
-    ],
-)
+@pytest.mark.parametrize(("form", "fractional"), sparing(itertools.product(FORMATS, (True, False)), IMAGES_OFTEN))
 def test_several_images(form, fractional):
     matrix, x = MATRIX / 3, points(True, 6)
     given = x if fractional else x @ matrix.T
