@@ -238,25 +238,6 @@ def test_extremes(name, reduce):
     np.testing.assert_allclose(slopes, of_x if q is None else of_x[0], rtol=1e-12, atol=1e-13)
 
 
-@pytest.mark.parametrize("name", ["nearest", "half images"])
-def test_symmetry(name):
-    """A function of i < j, or of a forward image, whose value the other end gets, too, or its negative."""
-    nbrs, x, _ = made(name)
-
-    @jax.jit
-    def both(x):
-        return [
-            jfrnn.pair_sum(lambda r, i, j: r * jnp.sum(r**4), x, None, neighbors=nbrs, symmetry=symmetry)
-            for symmetry in ("symmetric", "antisymmetric")
-        ]
-
-    pairs = by_numpy.in_order(by_numpy.forward(oracle(name, x)), 3)
-    r = by_numpy.vectors_of(pairs, np.asarray(x), np.asarray(x), np.diag(box_of(name, np.float64)))
-    terms = r * (r**4).sum(1)[:, None]
-    of_i, of_j = (by_numpy.add_up(terms, where, N) for where in (pairs.i, pairs.j))
-    np.testing.assert_allclose(both(x), [of_i + of_j, of_i - of_j], atol=1e-15)
-
-
 def test_in_two_dimensions_and_single_precision():
     nbrs, x, _ = made("nearest", np.float32, dim=2)
 
@@ -300,19 +281,6 @@ def test_what_has_no_translation_warns_once():
     square = (by_numpy.vectors_of(pairs, np.asarray(x), np.asarray(x)) ** 2).sum(1)
     terms = np.array([math.lgamma(1 + x) for x in square.tolist()])
     np.testing.assert_allclose(sums, by_numpy.add_up(terms, pairs.i, N), rtol=1e-12)
-
-
-def test_vmap():
-    nbrs, x, _ = made("half images")
-
-    def slopes(x):
-        return jax.grad(lambda x: jnp.sum(jfrnn.pair_sum(lambda r, i, j: jnp.sum(r**4), x, None, neighbors=nbrs)))(x)
-
-    several = np.stack([x, x + 0.002 * np.cos(np.arange(N))[:, None]])
-    for found, x in zip(jax.jit(jax.vmap(slopes))(several), several, strict=True):
-        pairs = by_numpy.in_order(oracle("half images", x), 3)
-        r = by_numpy.vectors_of(pairs, x, x, np.diag(box_of("half images", np.float64)))
-        np.testing.assert_allclose(found, by_numpy.pull(pairs, 4 * r**3, x), rtol=1e-12, atol=1e-13)
 
 
 @pytest.mark.parametrize("dtype", [slow(np.float32), np.float64])

@@ -143,16 +143,6 @@ def test_a_graph_is_one_of_jraph():
     assert (len(whole.senders), whole.n_node.tolist()) == (len(pairs.i), [len(x)])
 
 
-def test_vmap():
-    nbrs, x, _ = lists.make("full", "warp", "nearest")
-    several = np.stack([x, x + 0.005 * np.sin(np.arange(x.size)).reshape(x.shape)])
-    found = jax.jit(jax.vmap(jax.grad(lambda x: jnp.sum(nbrs.edges(x, 1500).displacement ** 3))))(several)
-    for slopes, x in zip(found, several, strict=True):
-        pairs = by_numpy.in_order(oracle("full", "nearest", x), 3)
-        expected = by_numpy.pull(pairs, 3 * by_numpy.vectors_of(pairs, x, x, np.eye(3)) ** 2, x)
-        np.testing.assert_allclose(slopes, expected, atol=1e-12)
-
-
 def test_nobody():
     x = jnp.zeros((0, 3))
     edges = jfrnn.search(x, 1.0, capacity=4).edges(x, 3)

@@ -126,20 +126,6 @@ def test_derivatives_with_queries():
 # --- where there is no answer ----------------------------------------------------------------------------------
 
 
-def test_where_a_search_cannot_answer_nothing_looks_like_an_answer():
-    x, m = scene(1, dim=3)
-
-    @jax.jit
-    def sums(x, lengths):
-        return fused(lambda r, i, j: j, x, 0.3, m, box=jfrnn.Box(lengths, (True, False, False)))
-
-    lengths, far = np.array([2.0, 1.0, 1.0]), np.array(x)
-    far[0, 0] = 1e12
-    assert np.isfinite(sums(x, lengths)).all()
-    for wrong in ((x, 0.1 * lengths), (far, lengths)):
-        assert np.isnan(sums(*wrong)).all()
-
-
 @functools.partial(jax.jit, static_argnames="rule")
 def open_marks(x, radii, ids, rule):
     return fused(marks, x, radii, ids, radius_rule=rule)
