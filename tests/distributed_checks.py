@@ -9,7 +9,6 @@ import functools
 import os
 import sys
 import warnings
-from pathlib import Path
 
 os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + " --xla_force_host_platform_device_count=8"
 
@@ -25,8 +24,6 @@ from jfrnn import distributed
 soon.compile_soon()
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
-
-GUIDE = Path(__file__).parent.parent / "docs" / "guides" / "many-devices.md"
 
 
 def mesh_of(*shape):
@@ -323,17 +320,6 @@ def sums_of_what_lies_on_the_mesh():
 
     ours = jax.jit(jax.value_and_grad(on_many, 1))(particles, h)
     np.testing.assert_allclose(ours, jax.value_and_grad(on_one)(jnp.asarray(0.3)), rtol=1e-12)
-
-
-@check
-def example_of_the_guide():
-    (example,) = (part.split("```")[0] for part in GUIDE.read_text().split("```python\n") if "distributed.collect" in part)
-    names = {}
-    exec(example, names)
-    i, j = names["nbrs"].pairs()
-    np.testing.assert_array_equal(np.bincount(i, minlength=2_000), jfrnn.count(names["x"], 1.0, backend="warp"))
-    np.testing.assert_array_equal(names["x_again"], names["x"])
-    assert len(i) == len(j)
 
 
 @check

@@ -43,21 +43,8 @@ def test_arguments_that_are_derived_stand_behind_those_of_their_bases():
 @pytest.mark.parametrize(
     "line",
     [
-        "int* const a;",
-        "int a[3];",
-        "int a = 1;",
-        "int a; int b;",
-        "int a, /* two */ b;",
-        "int **a;",
-        "int& a;",
-        "int a : 3;",
-        "unsigned int a;",
-        "long long a;",
-        "real a;",
-        "const real *a, b;",
-        "int a,",
-        "#if DIM > 2",
-        "struct { int a; };",
+        *("int* const a;", "int a[3];", "int a = 1;", "int a; int b;", "int a, /* two */ b;", "int **a;", "int& a;", "int a : 3;"),
+        *("unsigned int a;", "long long a;", "real a;", "const real *a, b;", "int a,", "#if DIM > 2", "struct { int a; };"),
     ],
 )
 def test_what_is_no_array_and_no_integer_is_refused(line):

@@ -122,9 +122,8 @@ def test_every_step_agrees_with_fractions(dtype, offset):
 
 
 LATTICES = list(itertools.product((1.0, 2.0**-22, 2.0**39), (True, False), (np.float32, np.float64)))
-OFTEN_IN_LATTICES = [
-    each for each in LATTICES if each[2] is np.float32 and each[1] is (each[0] == 1)
-]  # the wide integers of float64 take long to compile
+# The wide integers of float64 take long to compile.
+OFTEN_IN_LATTICES = [each for each in LATTICES if each[2] is np.float32 and each[1] is (each[0] == 1)]
 
 
 @pytest.mark.parametrize(("size", "orthogonal", "dtype"), sparing(LATTICES, OFTEN_IN_LATTICES))

@@ -190,11 +190,6 @@ def test_all_positions_non_finite(dim):
     assert jfrnn.Status(int(nbrs.status)) == jfrnn.Status.NONFINITE
 
 
-def test_every_status_bit_has_a_message():
-    assert all(bit.message for bit in jfrnn.Status)
-    assert jfrnn.Status.OK.message == "nothing to report."
-
-
 # --- transformations --------------------------------------------------------------------------------------------------
 
 

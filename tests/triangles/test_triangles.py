@@ -20,10 +20,8 @@ from jfrnn.cases.triangles import TRIANGLE_CASES, TriangleInput, padded
 
 BACKENDS = ("jax", "warp", "bvh")
 EXTREME = ("tiny_cutoff", "huge_cutoff")
-SCALED = (
-    "ties_small",
-    *EXTREME,
-)  # lengths are scaled: another program, which takes the array engine long; see `test_buckets_are_shared`
+# Lengths are scaled: another program, which takes the array engine long; see `test_buckets_are_shared`.
+SCALED = ("ties_small", *EXTREME)
 IN_CELLS = ("jax", "warp")
 CAPACITY = 40
 KINDS = list(product((np.float32, np.float64), (2, 3)))

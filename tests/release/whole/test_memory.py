@@ -206,11 +206,6 @@ def test_sums_take_what_is_stated(fn, names, gradient, bytes_):
     assert 0.8 * bytes_ * n < plan.total_bytes < bytes_ * n + 4000
 
 
-def test_the_gradient_of_a_density_takes_less_than_100_bytes_per_particle():
-    n = 1_000_000
-    assert jfrnn.memory_plan(n, 0.1, fn=density, values=numbers_of(n, np.float32, "m"), gradient=True).total_bytes < 100 * n
-
-
 SUMS = """
 import sys
 import jax, jfrnn
