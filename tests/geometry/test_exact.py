@@ -211,13 +211,3 @@ def test_exact_ties_are_known_without_integers(dtype):
     b = a + np.array([1.0, 2.0, 2.0], dtype)
     sign = signs_in_open_space(a, b, make_cutoff(3.0, np.dtype(dtype), closed=False))[0]
     np.testing.assert_array_equal(sign, np.zeros(256))
-
-
-def test_pairs_are_symmetric(dtype):
-    """Of shuffled pairs near the cutoff, (i, j) is listed if and only if (j, i) is."""
-    points = np.concatenate(ulp_pairs(dtype, seed=7, count=300, scale=0.1))
-    i, j = jfrnn.search(points, 0.1).pairs()
-    near = np.zeros((600, 600), bool)
-    near[i, j] = True
-    assert near.sum() == len(i) > 1000
-    np.testing.assert_array_equal(near, near.T)

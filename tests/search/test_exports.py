@@ -95,15 +95,6 @@ def test_all_that_leaves_a_list_says_the_same_pairs(kind):
         np.testing.assert_array_equal(nbrs.csr(positions=X, **given)[1], near[1])
 
 
-def test_a_pair_in_the_skin_has_its_shift():
-    x = jnp.asarray([[0.05, 0.5, 0.5], [0.93, 0.5, 0.5]], jnp.float32)
-    nbrs = jfrnn.search(x, 0.1, skin=0.05, box=jfrnn.Box([1.0] * 3))
-    i, j = nbrs.pairs()
-    shifts = np.asarray(nbrs.shifts(x))[np.asarray(nbrs.idx) < 2]
-    np.testing.assert_allclose(np.linalg.norm(np.asarray(x)[j] - np.asarray(x)[i] + shifts, axis=1), [0.12, 0.12], rtol=1e-6)
-    assert not nbrs.distances(x)[1].any()
-
-
 def test_edges_of_images_have_their_shifts():
     x = jnp.asarray([[0.5, 0.5, 0.5], [0.9, 0.5, 0.5]], jnp.float32)
     graph = jfrnn.search(x, 1.1, box=jfrnn.Box([1.0, 1.0, 1.0])).to_jraph(x, 64)

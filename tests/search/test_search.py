@@ -79,13 +79,6 @@ def test_more_queries_than_one_block(backend):
     checked.assert_exact(jfrnn.search(points, 0.02, capacity=40, backend=backend), points, 0.02)
 
 
-def test_order_of_the_input_does_not_matter(dim):
-    points = random_points(400, dim, np.float32)
-    shuffled = np.random.default_rng(3).permutation(400)
-    i, j = jfrnn.search(points[shuffled], 0.15).pairs()
-    assert set(zip(shuffled[i].tolist(), shuffled[j].tolist(), strict=True)) == reference.reference_pairs(points, 0.15)
-
-
 @pytest.mark.parametrize("backend", [slow("jax"), BRUTE, "warp", "hashgrid"])
 def test_same_input_gives_the_same_bits(backend):
     points = random_points(3000, 3, np.float32)
@@ -193,20 +186,6 @@ def test_all_positions_non_finite(dim):
 # --- transformations --------------------------------------------------------------------------------------------------
 
 
-def test_jit_traces_once_for_new_positions():
-    traces = []
-
-    @jax.jit
-    def neighbors(x):
-        traces.append(x.shape)
-        return jfrnn.search(x, 0.2, capacity=64)
-
-    for seed in range(3):
-        points = random_points(200, 2, np.float32, seed)
-        checked.assert_exact(neighbors(points), points, 0.2)
-    assert len(traces) == 1
-
-
 @pytest.mark.parametrize("backend", ["jax", "warp"])
 def test_one_program_serves_every_cutoff(backend):
     from jfrnn._search.making import find_fields
@@ -219,13 +198,6 @@ def test_one_program_serves_every_cutoff(backend):
         checked.assert_exact(first, points, cutoff)
         np.testing.assert_array_equal(first.idx, second.idx)  # the same bits
     assert find_fields.cache_size() == before
-
-
-@pytest.mark.parametrize("backend", [slow("jax"), "warp"])
-def test_closed_over_positions_are_counted_while_tracing(backend):
-    points = random_points(50, 2, np.float32)
-    nbrs = jax.jit(lambda: jfrnn.search(points, 0.2, backend=backend))()
-    checked.assert_exact(nbrs, points, 0.2)
 
 
 @pytest.mark.parametrize("backend", ["jax", BRUTE, "warp", "hashgrid"])

@@ -292,13 +292,6 @@ def test_guards_against_transfers_are_kept(guard, x):
         jfrnn.count(x, CUTOFF)
 
 
-def test_brute_force_of_a_batch_with_64_bits():
-    """Places of particles are int32, also where JAX's default integers are wider."""
-    batch = given()["batch"]
-    nbrs = jfrnn.search(given()["x"], CUTOFF, batch=batch, backend="brute", capacity=16)
-    np.testing.assert_array_equal(nbrs.count, jfrnn.count(given()["x"], CUTOFF, batch=batch))
-
-
 @pytest.mark.parametrize("dtype", [np.int8, np.uint32, np.int64])
 def test_faces_of_any_integers(dtype):
     """On the device they stay there; what names no vertex is told, whatever the type."""
