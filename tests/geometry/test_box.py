@@ -248,15 +248,6 @@ def test_gradients_in_positions_and_box(vectors):
         assert np.abs(right).max() > 0.01
 
 
-def test_grow_and_replay_in_a_box():
-    x = points(60, scale=1.0)
-    nbrs = jfrnn.search(x, 0.2, box=jfrnn.Box(LENGTHS), capacity=2)
-    assert nbrs.overflow
-    grown = nbrs.grow(x)
-    grown.check()
-    assert image_pairs(grown, x) == oracle(x, 0.2, LENGTHS)
-
-
 LONG = np.array([[1.0, 0.0, 0.0], [30.3, 1.1, 0.0], [-17.2, 21.1, 0.9]]) @ np.linalg.qr(SKEWED + 1)[0]
 
 

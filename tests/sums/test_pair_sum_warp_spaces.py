@@ -75,18 +75,6 @@ def test_where_no_pair_crosses_the_box(fn):
         assert_marks(sums(at), pairs, at, matrix=lengths)
 
 
-@pytest.mark.slow
-def test_options():
-    """Closed, with themselves, where it decides something."""
-    given = PERIODIC_CASES["crystal_integer"].build(np.float32, 3)
-    kind = {"matrix": given.matrix, "periodic": given.periodic}
-    few, all_of_them = (
-        reference.reference_images(given.positions, given.cutoff, closed=flag, include_self=flag, **kind) for flag in (False, True)
-    )
-    assert len(all_of_them) > len(few) + len(given.positions)
-    assert_case("crystal_integer", np.float32, 3, closed=True, include_self=True)
-
-
 @pytest.mark.parametrize("name", ["periodic", slow("periodic_images")])
 def test_batches(name):
     """In a box that is traced: its image is the nearest one, or how many are looked at is said."""
