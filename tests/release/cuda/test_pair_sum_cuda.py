@@ -124,22 +124,17 @@ def test_terms_that_read_nothing_compile():
     assert compiles_for(plan, 3, False)
 
 
-def test_what_a_term_reads_is_sorted_before_it_is_summed():
-    plan = plan_of(square_sum, *arguments(np.float32, 3)[:3])
-    kernels = pair_sum_cuda.sum_kernels(Kind(3, False), plan.text, plan.key)
-    sort_values, query = kernels.launches(1000, 500, 132)
-    assert (sort_values.kernel, query.kernel) == (kernels.sort_values, kernels.query)
-    assert query.threads == 32 * pair_sum_cuda.slots(500)
-    assert all(launch.threads % launch.kernel.block == 0 for launch in (sort_values, query))
-
-
-def test_queries_that_leave_a_box_have_a_kernel_beside_the_others():
-    masses, x, scale, _ = arguments(np.float32, 3)
-    plan = plan_of(functools.partial(square_sum, box=jfrnn.Box([2.0, 2.0, 2.0])), masses, x, scale)
-    kernels = pair_sum_cuda.sum_kernels(Kind(3, False, periodic=1), plan.text, plan.key)
+@pytest.mark.parametrize("periodic", [0, 1])
+def test_what_a_term_reads_is_sorted_before_it_is_summed(periodic):
+    """Queries that leave a box have a kernel beside the others."""
+    box = jfrnn.Box([2.0, 2.0, 2.0]) if periodic else None
+    plan = plan_of(functools.partial(square_sum, box=box), *arguments(np.float32, 3)[:3])
+    kernels = pair_sum_cuda.sum_kernels(Kind(3, False, periodic=periodic), plan.text, plan.key)
     launches = kernels.launches(1000, 500, 132)
-    assert [launch.kernel for launch in launches] == [kernels.sort_values, kernels.crossing, kernels.query]
-    assert [launch.beside for launch in launches] == [False, False, True]
+    assert [launch.kernel for launch in launches] == [kernels.sort_values, *[kernels.crossing] * periodic, kernels.query]
+    assert [launch.beside for launch in launches] == [False, False] + [True] * periodic
+    assert periodic or launches[-1].threads == 32 * pair_sum_cuda.slots(500)
+    assert all(launch.threads % launch.kernel.block == 0 for launch in launches)
 
 
 @pytest.mark.parametrize("double", [False, True])
