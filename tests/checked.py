@@ -26,6 +26,7 @@ def slowly(*cases):
 
 def sparing(cases, often):
     """Return parameters of tests, of which only those that stand in `often` run by default."""
+    often = list(often)
     return [case if case in often else slow(*case) for case in map(tuple, cases)]
 
 

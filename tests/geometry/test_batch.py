@@ -9,13 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
-from checked import slow
+from checked import slow, sparing
 from test_box import image_pairs, masked_images
 
 import jfrnn
 from jfrnn.cases.batches import BATCH_CASES
 
-SLOW = pytest.mark.slow
 LENGTH, CAPACITY = 136, 256
 
 
@@ -58,29 +57,23 @@ def assert_case(name, dtype, dim, backend, closed=False, **options):
     checked.assert_same(found, expected_images(name, dtype, dim, closed))
 
 
-def each_case():
-    """Yield every case, kind and engine; by default two kinds of cases that share a program, one of others and of array engines."""
-    alone = {"queries": (np.float32, 3), "periodic": (np.float32, 3), "periodic_images": (np.float64, 2)}
-    for name, dtype, dim, backend in product(BATCH_CASES, (np.float32, np.float64), (2, 3), ("jax", "warp", "brute")):
-        walked = [alone[name]] if name in alone else [(np.float32, 3), (np.float64, 2)]
-        often = {"warp": walked, "jax": [] if name in alone else [(np.float32, 2)], "brute": []}[backend]
-        rarely = (dtype, dim) not in often
-        kind = f"{name}-f{8 * dtype().itemsize}-{dim}d-{backend}"
-        yield pytest.param(name, dtype, dim, backend, id=kind, marks=[SLOW] * rarely)
+# By default two kinds of cases that share a program, one of others and of array engines.
+ALONE = {"queries": (np.float32, 3), "periodic": (np.float32, 3), "periodic_images": (np.float64, 2)}
+SHARING = [name for name in BATCH_CASES if name not in ALONE]
+OFTEN = [(name, *kind, "warp") for name, kind in ALONE.items()] + list(product(SHARING, [np.float32], [2], ["jax"]))
+OFTEN += [(name, *kind, "warp") for name in SHARING for kind in ((np.float32, 3), (np.float64, 2))]
+EACH = list(product(BATCH_CASES, (np.float32, np.float64), (2, 3), ("jax", "warp", "brute")))
 
 
-@pytest.mark.parametrize(("name", "dtype", "dim", "backend"), list(each_case()))
+@pytest.mark.parametrize(("name", "dtype", "dim", "backend"), sparing(EACH, OFTEN))
 def test_case(name, dtype, dim, backend):
     assert_case(name, dtype, dim, backend)
 
 
-def each_case_with_radii():
-    for name, kind, backend in product(BATCH_CASES, ((np.float32, 3), (np.float64, 2)), ("warp", "jax")):
-        rarely = backend == "jax" or kind[1] != 3 or name in ("queries", "periodic", "periodic_images")  # programs of their own
-        yield pytest.param(name, *kind, backend, id=f"{backend}-f{8 * kind[0]().itemsize}-{kind[1]}d-{name}", marks=[SLOW] * rarely)
+WITH_RADII = [case for case in EACH if case[1:3] in ((np.float32, 3), (np.float64, 2)) and case[3] != "brute"]
 
 
-@pytest.mark.parametrize(("name", "dtype", "dim", "backend"), list(each_case_with_radii()))
+@pytest.mark.parametrize(("name", "dtype", "dim", "backend"), sparing(WITH_RADII, product(SHARING, [np.float32], [3], ["warp"])))
 def test_case_with_a_cutoff_per_particle(name, dtype, dim, backend):
     rule = "gather" if name == "queries" else "mean"  # of all of them, the same cutoff
     assert_case(name, dtype, dim, backend, radii=True, radius_rule=rule)

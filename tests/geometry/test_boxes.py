@@ -9,13 +9,12 @@ import numpy as np
 import pytest
 import reference
 from by_numpy import in_order
-from checked import as_set, assert_same, padded, refuses, slow
+from checked import as_set, assert_same, padded, refuses, slow, sparing
 from test_box import energy_and_slopes, masked_images, unpacked
 
 import jfrnn
 from jfrnn.cases.crystals import CRYSTAL_CASES
 
-SLOW = pytest.mark.slow
 CAPACITY = {2: 96, 3: 256}
 
 
@@ -105,16 +104,12 @@ def assert_case(name, dtype, dim, backend, closed=False, half=False, geometry=Fa
     assert (nbrs.images is None) == (name == "nearest")
 
 
-def each_case():
-    """Yield every case, kind and engine; by default one kind on Warp, and a case on each engine that compiles slowly."""
-    often = {("slabs", np.float32, 3, "jax"), ("absent", np.float64, 2, "brute")}
-    for name, dtype, dim, backend in product(CRYSTAL_CASES, (np.float32, np.float64), (2, 3), ("jax", "warp", "brute")):
-        by_default = (name, dtype, dim, backend) in often or (backend == "warp" and (dtype, dim) == (np.float32, 3))
-        kind = f"{name}-f{8 * dtype().itemsize}-{dim}d-{backend}"
-        yield pytest.param(name, dtype, dim, backend, id=kind, marks=[SLOW] * (not by_default))
+EACH = list(product(CRYSTAL_CASES, (np.float32, np.float64), (2, 3), ("jax", "warp", "brute")))
+# By default one kind on Warp, and a case on each engine that compiles slowly.
+OFTEN = [("slabs", np.float32, 3, "jax"), ("absent", np.float64, 2, "brute"), *product(CRYSTAL_CASES, [np.float32], [3], ["warp"])]
 
 
-@pytest.mark.parametrize(("name", "dtype", "dim", "backend"), list(each_case()))
+@pytest.mark.parametrize(("name", "dtype", "dim", "backend"), sparing(EACH, OFTEN))
 def test_case(name, dtype, dim, backend):
     geometry = backend == "warp" and name == "unreduced"  # where shifts of the list count other vectors than the given ones
     own_program = backend != "warp" or name in ("lengths", "nearest", "queries", "unreduced")

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import reference
 from by_numpy import in_order
-from checked import slow
+from checked import slow, sparing
 from test_box import masked_images, pull_back
 from test_boxes import box_of, listed_images, system_by_system
 from test_search_edges import edges_as_set
@@ -80,17 +80,11 @@ def scene(name, dtype, dim, who):
     return Scene(name, dtype, dim, who)
 
 
-def each_case():
-    """Yield every case, rule, kind and engine; by default one on Warp, since others take long to compile."""
-    often = {("queries", "mean", np.float32, 3, "warp")}
-    kinds = product(CRYSTAL_CASES, (*RULES, "table"), (np.float32, np.float64), (2, 3), ("warp", "jax", "brute"))
-    for name, who, dtype, dim, backend in kinds:
-        kind = f"{name}-{who}-f{8 * dtype().itemsize}-{dim}d-{backend}"
-        marks = [] if (name, who, dtype, dim, backend) in often else [SLOW]
-        yield pytest.param(name, who, dtype, dim, backend, id=kind, marks=marks)
+KINDS = list(product(CRYSTAL_CASES, (*RULES, "table"), (np.float32, np.float64), (2, 3), ("warp", "jax", "brute")))
+OFTEN = [("queries", "mean", np.float32, 3, "warp")]  # others take long to compile
 
 
-@pytest.mark.parametrize(("name", "who", "dtype", "dim", "backend"), list(each_case()))
+@pytest.mark.parametrize(("name", "who", "dtype", "dim", "backend"), sparing(KINDS, OFTEN))
 def test_case(name, who, dtype, dim, backend):
     given = scene(name, dtype, dim, who)
     nbrs = given.search(backend, capacity=CAPACITY[dim])

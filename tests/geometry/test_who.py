@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
-from checked import refuses, slow, slowly
+from checked import refuses, slow, slowly, sparing
 from test_box import image_pairs
 
 import jfrnn
@@ -55,17 +55,12 @@ def asked(who, x, species, pairs):
     return (TABLE.astype(x.dtype), {"species": species} | exclude) if "table" in who else (3 / 8, exclude)
 
 
-def each_case():
-    often = {("table, exclude", "images", "warp", 3, np.float32), ("table", "open", "warp", 2, np.float64)}
-    often |= {("exclude", "open", "warp", 3, np.float32)}
-    for who, box, backend in product(("exclude", "table", "table, exclude"), BOXES, ("warp", "jax", "brute")):
-        for dim, dtype in product((2, 3), (np.float32, np.float64)):
-            kind = f"{who}-{box}-{backend}-{dim}d-f{8 * dtype().itemsize}"
-            marks = [] if (who, box, backend, dim, dtype) in often else [SLOW]
-            yield pytest.param(who, box, backend, dim, dtype, id=kind, marks=marks)
+OFTEN = {("table, exclude", "images", "warp", 3, np.float32), ("table", "open", "warp", 2, np.float64)}
+OFTEN |= {("exclude", "open", "warp", 3, np.float32)}
+EACH = list(product(("exclude", "table", "table, exclude"), BOXES, ("warp", "jax", "brute"), (2, 3), (np.float32, np.float64)))
 
 
-@pytest.mark.parametrize(("who", "box", "backend", "dim", "dtype"), list(each_case()))
+@pytest.mark.parametrize(("who", "box", "backend", "dim", "dtype"), sparing(EACH, OFTEN))
 def test_case(who, box, backend, dim, dtype):
     x, species, pairs = scene(dtype, dim)
     cutoff, given = asked(who, x, species, pairs)
@@ -316,21 +311,14 @@ LATTICES = {
     "short": np.array([[1.0, 0, 0], [30.3, 1.1, 0], [-17.2, 21.1, 0.9]]),
     "slab": np.diag([0.8, 1.1, 0.9]),
 }
-IMAGES_OFTEN = {("images", "radii", "warp"), ("short", "half", "warp"), ("images", "plain", "jax")}  # queries: their derivatives
+GIVEN = product(LATTICES, ("plain", "radii", "species", "batch", "half", "queries"), ("warp", "jax", "brute"))
+IMAGES_OFTEN = [("images", "radii", "warp"), ("short", "half", "warp"), ("images", "plain", "jax")]  # queries: their derivatives
 
 
-def each_image_case():
-    for lattice, kind, backend in product(
-        LATTICES, ("plain", "radii", "species", "batch", "half", "queries"), ("warp", "jax", "brute")
-    ):
-        for dtype in (np.float32, np.float64):
-            name = f"{lattice}-{kind}-{backend}-{dtype.__name__}"
-            if (lattice, kind, backend) in IMAGES_OFTEN and dtype == np.float32:
-                yield pytest.param(lattice, kind, backend, dtype, False, id=name)
-            yield slow(lattice, kind, backend, dtype, True, id=f"{name}-summed")
-
-
-@pytest.mark.parametrize(("lattice", "kind", "backend", "dtype", "summed"), list(each_image_case()))
+@pytest.mark.parametrize("dtype", [np.float32, slow(np.float64)])
+@pytest.mark.parametrize(
+    ("lattice", "kind", "backend", "summed"), [*((*each, False) for each in IMAGES_OFTEN), *(slow(*each, True) for each in GIVEN)]
+)
 def test_excluded_images(lattice, kind, backend, dtype, summed):
     """Pairs (i, j, S) are no neighbors, other images of them are, wherever particles lie; sums know nothing of them, either."""
     rng, given, cutoff = np.random.default_rng(6), LATTICES[lattice], 0.6

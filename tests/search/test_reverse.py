@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
-from checked import slow
+from checked import slow, sparing
 from test_kept import by_arrays
 
 import jfrnn
@@ -26,7 +26,6 @@ KINDS = {
 }
 CAPACITY = 64  # given: a program that counts would be compiled besides
 N, ASKING, CUTOFF = 40, 17, 0.4
-SLOW = pytest.mark.slow
 
 
 def options_of(kind, box="open", dtype=np.float64):
@@ -68,27 +67,21 @@ def assert_all_slots(nbrs):
 
 
 # In all kinds of boxes the lists of the most usual kind, the others in some; by hand all.
-SOME = [*(("full", box) for box in BOXES), ("self", "images"), ("half", "nearest"), ("half", "images")]
-SOME += [("gather", "nearest"), ("queries", "open")]
-
-
-def each_list(kinds):
-    """Yield these kinds of lists in each box, by default those of `SOME`."""
-    for kind, box in product(kinds, BOXES):
-        yield pytest.param(kind, box, "warp", marks=[SLOW] * ((kind, box) not in SOME))
-
-
+SOME = [*product(["full"], BOXES, ["warp"]), ("self", "images", "warp"), ("half", "nearest", "warp"), ("half", "images", "warp")]
+SOME += [("gather", "nearest", "warp"), ("queries", "open", "warp")]
 BY_ARRAYS = [("half", "open", "brute"), slow("queries", "images", "brute")]
 
 
-@pytest.mark.parametrize(("kind", "box", "backend"), [*each_list(KINDS), *BY_ARRAYS])
+@pytest.mark.parametrize(("kind", "box", "backend"), [*sparing(product(KINDS, BOXES, ["warp"]), SOME), *BY_ARRAYS])
 def test_each_source_has_all_its_slots(kind, box, backend):
     nbrs, *_ = make(kind, backend, box)
     assert (np.asarray(nbrs.idx) < nbrs.source_count).sum() > 100
     assert_all_slots(nbrs)
 
 
-@pytest.mark.parametrize(("kind", "box", "backend"), [*each_list(("full", "self", "either")), ("self", "images", "brute")])
+@pytest.mark.parametrize(
+    ("kind", "box", "backend"), [*sparing(product(("full", "self", "either"), BOXES, ["warp"]), SOME), ("self", "images", "brute")]
+)
 def test_each_image_has_its_own_reverse(kind, box, backend):
     nbrs, x, _ = make(kind, backend, box)
     rows, slots = np.asarray(nbrs.idx), np.asarray(nbrs.reverse.slots).reshape(-1)
@@ -276,10 +269,7 @@ PAIRWISE = [("open", 2, 1.0, True, np.float64), ("images", 3, 1.0, False, np.flo
 
 @pytest.mark.parametrize(
     ("box", "dim", "scale", "skinned", "dtype"),
-    [
-        pytest.param(*each, skinned, dtype, marks=[SLOW] * ((*each, skinned, dtype) not in PAIRWISE))
-        for each, skinned, dtype in product(MEASURED, (False, True), (np.float32, np.float64))
-    ],
+    sparing(((*each, *kind) for each, kind in product(MEASURED, product((False, True), (np.float32, np.float64)))), PAIRWISE),
 )
 def test_distances_are_the_lengths_of_vectors(box, dim, scale, skinned, dtype):
     """Of points of which two coincide and two nearly do, in rows whose length is no multiple of four; derivatives, too."""

@@ -14,7 +14,7 @@ import sys
 import jax
 import numpy as np
 import pytest
-from checked import refuses, slow
+from checked import refuses, slow, sparing
 from jax import lax
 from jax import numpy as jnp
 from translated import Case, kernel_of, run
@@ -94,15 +94,13 @@ def assert_close(found, expected, ulp, scale, rows, inputs):
     assert not len(wrong), f"{len(wrong)} of {ok.size}: inputs, found, expected, ulp {shown}"
 
 
-def each_case():
-    """Yield every operation in every kind; what is made of many takes Clang long as vectors: pair sums are such."""
-    for real, kind, name in itertools.product(("float32", "float64"), ("scalar", "vector"), CASES):
-        group = "of_one" if name in GROUPS["of_one"] else "of_many"
-        rarely = (kind, group) == ("vector", "of_many")
-        yield pytest.param(real, kind, group, name, id=f"{real}-{kind}-{name}", marks=[pytest.mark.slow] * rarely)
+EACH = [
+    (*kind, name) for kind in itertools.product(("float32", "float64"), ("scalar", "vector"), GROUPS) for name in GROUPS[kind[2]]
+]
+OFTEN = [case for case in EACH if case[1:3] != ("vector", "of_many")]  # which take Clang long as vectors: pair sums are such
 
 
-@pytest.mark.parametrize(("real", "kind", "group", "name"), list(each_case()))
+@pytest.mark.parametrize(("real", "kind", "group", "name"), sparing(EACH, OFTEN))
 def test_cases(real, kind, group, name):
     case, inputs = CASES[name], inputs_of(name, real)
     found = run(kernel(real, kind, group), list(GROUPS[group]).index(name), case, inputs)
