@@ -1,13 +1,39 @@
-"""Search, and compare what came back with the oracle as a set of pairs. Shapes and dtypes are checked on the way."""
+"""Search, and compare what came back with the oracle as a set of pairs. Shapes and dtypes are checked on the way.
+
+And which parameters of a test are for runs by hand.
+"""
 
 import jax
 import numpy as np
+import pytest
 import reference
 from beartype import beartype
 from jax import Array
 from jaxtyping import Bool, Int32, jaxtyped
 
 import jfrnn
+
+
+def slow(*values, **more):
+    """Return parameters of a test that runs by hand."""
+    return pytest.param(*values, marks=pytest.mark.slow, **more)
+
+
+def slowly(*cases):
+    """Return parameters of tests that all run by hand."""
+    return [slow(*case) for case in cases]
+
+
+def sparing(cases, often):
+    """Return parameters of tests, of which only those that stand in `often` run by default."""
+    often = list(often)
+    return [case if case in often else slow(*case) for case in map(tuple, cases)]
+
+
+def refuses(error, match, call, /, *given, **options):
+    """Fail unless a call raises an error that says this."""
+    with pytest.raises(error, match=match):
+        call(*given, **options)
 
 
 @jaxtyped(typechecker=beartype)
@@ -36,11 +62,28 @@ def assert_exact(nbrs, positions, cutoff, *, queries=None, **options):
 
 def assert_pairs(nbrs, expected):
     """Fail unless the list holds exactly these pairs, a set."""
-    found = set(found_pairs(nbrs))  # which holds none twice
-    if found == expected:
-        return
+    assert_same(set(found_pairs(nbrs)), expected)  # which holds none twice
+
+
+def assert_same(found, expected):
+    """Fail unless two sets are the same, and tell how they differ."""
     missing, extra = expected - found, found - expected
     assert (len(missing), len(extra)) == (0, 0), f"missing {sorted(missing)[:5]}, extra {sorted(extra)[:5]} of {len(expected)}"
+
+
+def as_set(i, j, shifts=None):
+    """Return pairs (i, j), or images (i, j, S) with shifts [e, d], as a set; fail where one stands there twice."""
+    columns = [np.asarray(i).tolist(), np.asarray(j).tolist()]
+    columns += [] if shifts is None else [map(tuple, np.asarray(shifts).astype(int).tolist())]
+    listed = list(zip(*columns, strict=True))
+    assert len(set(listed)) == len(listed)
+    return set(listed)
+
+
+def slots_as_set(idx, mask, shifts=None):
+    """Return the pairs, or the images, of those slots [m, capacity] that a mask names."""
+    i, k = np.nonzero(np.asarray(mask))
+    return as_set(i, np.asarray(idx)[i, k], None if shifts is None else np.asarray(shifts)[i, k])
 
 
 def padded(points, length):

@@ -46,9 +46,9 @@ LONGEST = (
     "triangles_closest", "cases_periodic", "boxes", "exact", "reverse", "radii", "search", "memory", "pair_sum_warp", "reference",
     "arrays", "triangles_cuda", "order", "experiments_peers", "experiments_gpu", "notebooks", "jax_md", "boxes_radii",
     "distributed", "verlet", "joint", "pair_sum_cuda", "sph_solids", "verlet_boxes", "edges", "fractional", "transforms", "batch",
-    "modes", "spread", "translate", "cell_line", "start", "pair_sum_warp_boxes", "experiments_lists", "experiments_lj", "who",
+    "modes", "spread", "translate", "cell_line", "start", "pair_sum_warp_spaces", "experiments_lists", "experiments_lj", "who",
     "neighbors", "native", "experiments_sums", "triangles_contacts", "cells", "sph_speed", "sph_parts", "search_edges",
-    "experiments_methods", "sph_run", "triangles_moving", "ase", "exports", "travel", "pair_sum_warp_radii", "buffers", "package",
+    "experiments_methods", "sph_run", "triangles_moving", "ase", "exports", "travel", "buffers", "package",
     "experiments_distributed", "experiments_start", "experiments_report", "experiments_commands", "house", "interrupts",
 )  # fmt: skip
 

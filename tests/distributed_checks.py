@@ -6,13 +6,9 @@ compare with rational arithmetic.
 
 import dataclasses
 import functools
-import json
 import os
 import sys
-import time
-import traceback
 import warnings
-from pathlib import Path
 
 os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + " --xla_force_host_platform_device_count=8"
 
@@ -20,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import soon
+from children import check, main
 
 import jfrnn
 from jfrnn import distributed
@@ -27,14 +24,6 @@ from jfrnn import distributed
 soon.compile_soon()
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
-
-CHECKS = {}
-GUIDE = Path(__file__).parent.parent / "docs" / "guides" / "many-devices.md"
-
-
-def check(fn):
-    CHECKS[fn.__name__] = fn
-    return fn
 
 
 def mesh_of(*shape):
@@ -334,17 +323,6 @@ def sums_of_what_lies_on_the_mesh():
 
 
 @check
-def example_of_the_guide():
-    (example,) = (part.split("```")[0] for part in GUIDE.read_text().split("```python\n") if "distributed.collect" in part)
-    names = {}
-    exec(example, names)
-    i, j = names["nbrs"].pairs()
-    np.testing.assert_array_equal(np.bincount(i, minlength=2_000), jfrnn.count(names["x"], 1.0, backend="warp"))
-    np.testing.assert_array_equal(names["x_again"], names["x"])
-    assert len(i) == len(j)
-
-
-@check
 def sums_over_lists_and_their_gradients():
     sums_and_their_gradients(listed=True)
 
@@ -465,16 +443,6 @@ def wrong_arguments_are_named():
     raises(ValueError, "anew", distributed.count, roomy(particles), 0.1, halo=distributed.halo(particles))
 
 
-def main(names):
-    warnings.simplefilter("error")
-    for name in names or CHECKS:
-        wrong, before = None, time.process_time()
-        try:
-            CHECKS[name]()
-        except Exception:
-            wrong = traceback.format_exc()
-        print(json.dumps({"name": name, "wrong": wrong, "cpu_s": time.process_time() - before}), flush=True)
-
-
 if __name__ == "__main__":
+    warnings.simplefilter("error")
     main(sys.argv[1:])

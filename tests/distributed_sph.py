@@ -2,9 +2,11 @@
 
 import sys
 import tempfile
+import warnings
 from pathlib import Path
 
-from distributed_checks import CHECKS, by_id, check, main, mesh_of  # first: it asks for 8 devices
+from distributed_checks import by_id, mesh_of  # isort: skip  # first: it asks for 8 devices
+from children import CHECKS, check, main
 
 CHECKS.clear()
 
@@ -69,4 +71,5 @@ def particles_that_enter():
 
 
 if __name__ == "__main__":
+    warnings.simplefilter("error")
     main(sys.argv[1:])

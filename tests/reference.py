@@ -292,19 +292,6 @@ def _minus(a: Sequence[Any], b: Sequence[Any]) -> list[Any]:
     return [x - y for x, y in zip(a, b, strict=True)]
 
 
-def compare(found: Any, expected: Iterable[Pair]) -> tuple[set[Pair], set[Pair]]:
-    """Return the pairs that `found` misses of `expected`, and the pairs that it has beyond them.
-
-    `found` is an iterable of (i, j), an array [m, 2], or a tuple of two arrays (i, j), each [m]. A pair that stands in
-    it twice fails, because sets could not show it.
-    """
-    if isinstance(found, tuple) and len(found) == 2 and all(getattr(part, "ndim", 0) == 1 for part in found):
-        found = zip(np.asarray(found[0]).tolist(), np.asarray(found[1]).tolist(), strict=True)
-    pairs, wanted = [(int(i), int(j)) for i, j in found], set(expected)
-    once = _refuse_repeats(pairs)
-    return wanted - once, once - wanted
-
-
 def pairs_of(idx: Any, count: Any, n_sources: int) -> list[Pair]:
     """Return the pairs (i, j) of a padded list: idx int32 [n, capacity], count int32 [n], maybe above the capacity.
 

@@ -3,10 +3,8 @@
 Prints a line of JSON for each: its name, and what was wrong, or null. What is expected is what one device finds.
 """
 
-import json
 import os
 import sys
-import traceback
 
 os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + " --xla_force_host_platform_device_count=4"
 
@@ -14,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import soon
+from children import check, main
 from jax.sharding import AxisType, NamedSharding, PartitionSpec
 
 import jfrnn
@@ -22,16 +21,10 @@ jax.config.update("jax_enable_x64", True)
 soon.compile_soon()
 jax.config.update("jax_disable_most_optimizations", True)
 
-CHECKS = {}
 RNG = np.random.default_rng(0)
 X, R = RNG.uniform(0, 2, (16, 2)).astype(np.float32), RNG.uniform(0.3, 0.9, 16).astype(np.float32)
 CORNERS = np.array([[0, 0], [2, 0], [2, 2], [0, 2]], np.float32)
 SIDES = np.array([[0, 1], [1, 2], [2, 3], [3, 0]])
-
-
-def check(fn):
-    CHECKS[fn.__name__] = fn
-    return fn
 
 
 def weight(r, i, j):
@@ -64,8 +57,8 @@ def over_lists(x, r):
     return [jax.grad(energy)(x) for energy in energies]
 
 
-def near_walls(x, r):
-    tri = jfrnn.search_triangles(x, CORNERS, SIDES, 0.4, capacity=8)
+def near_walls(x, r, backend="auto"):
+    tri = jfrnn.search_triangles(x, CORNERS, SIDES, 0.4, capacity=8, backend=backend)
     return tri, tri.update(x)
 
 
@@ -75,6 +68,7 @@ QUICK = {
     "sum": summed,
     "lists": over_lists,
     "walls": near_walls,
+    "walls in cells": lambda x, r: near_walls(x, r, "warp"),
     "order": lambda x, r: jfrnn.sort_order(x, 0.5),
 }
 MORE = {
@@ -163,6 +157,8 @@ def moving(x, r, **options):
 def shard_map_as_it_is_by_itself():
     systems_of_devices(lambda x, r: (jfrnn.count(x, 0.5), *summed(x, r)))
     systems_of_devices(moving)
+    for backend in ("warp", "bvh"):
+        systems_of_devices(lambda x, r, backend=backend: [tri.idx for tri in near_walls(x, r, backend)])
 
 
 @check
@@ -198,16 +194,6 @@ def what_devices_share_keeps_its_gradient():
     spec = PartitionSpec()
     counted = jax.jit(jax.shard_map(lambda x: jfrnn.count(x, 0.5), mesh=MESH, in_specs=spec, out_specs=spec))(X)
     np.testing.assert_array_equal(counted, jfrnn.count(X, 0.5))
-
-
-def main(names):
-    for name in names:
-        wrong = None
-        try:
-            CHECKS[name]()
-        except Exception:
-            wrong = traceback.format_exc()
-        print(json.dumps({"name": name, "wrong": wrong}), flush=True)
 
 
 if __name__ == "__main__":

@@ -21,10 +21,6 @@ EXTREMES = {
 }
 
 
-def edges(real):
-    return np.array(EDGES + EXTREMES[real], real)
-
-
 def random_reals(rng, shape, real):
     """Draw numbers of every size around 1, half of them negative."""
     return (rng.choice([-1, 1], shape) * 10.0 ** rng.uniform(-5, 3, shape)).astype(real)
@@ -36,7 +32,7 @@ def anything(*arity_and_bounds):
 
     def draw(rng, real):
         columns = [random_reals(rng, N, real) for _ in range(arity)]
-        special = list(itertools.product(edges(real), repeat=min(arity, 2)))
+        special = list(itertools.product(np.array(EDGES + EXTREMES[real], real), repeat=min(arity, 2)))
         for column, values in zip(columns, zip(*special)):
             column[: len(values)] = values
         if low is not None:

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
+from checked import as_set, refuses, slots_as_set, slow, sparing
 
 from jfrnn import jax_md
 
@@ -53,12 +54,9 @@ def points(fractional, n=N):
 
 def pairs_of(idx, n, form):
     if form.name == "Dense":
-        i, k = np.nonzero(np.asarray(idx) < n)
-        found = list(zip(i.tolist(), np.asarray(idx)[i, k].tolist()))
-    else:
-        found = [(i, j) for j, i in np.asarray(idx).T.tolist() if j < n]
-    assert len(found) == len(set(found))
-    return set(found)
+        return slots_as_set(idx, np.asarray(idx) < n)
+    used = np.asarray(idx)[0] < n
+    return as_set(*np.asarray(idx)[::-1, used])
 
 
 def expected(x, space, form, skin=SKIN):
@@ -71,10 +69,7 @@ def expected(x, space, form, skin=SKIN):
 OFTEN = [("free", jax_md.Dense), ("periodic", jax_md.OrderedSparse)]  # fractions: where boxes change
 
 
-@pytest.mark.parametrize(
-    ("space", "form"),
-    [pytest.param(*each, marks=[pytest.mark.slow] * (each not in OFTEN)) for each in itertools.product(SPACES, FORMATS)],
-)
+@pytest.mark.parametrize(("space", "form"), sparing(itertools.product(SPACES, FORMATS), OFTEN))
 def test_pairs_in_a_loop(space, form):
     displacement, box, fractional = SPACES[space]
     fns = jax_md.neighbor_list(displacement, box, CUTOFF, SKIN, fractional_coordinates=fractional, format=form)
@@ -98,15 +93,10 @@ def test_pairs_in_a_loop(space, form):
     np.testing.assert_array_equal(still.reference_position, x)
 
 
-@pytest.mark.parametrize(
-    ("form", "euclidean"),
-    [
-        (jax_md.Dense, False),
-        (jax_md.Sparse, True),
-        *(pytest.param(*each, marks=pytest.mark.slow) for each in ((jax_md.Dense, True), (jax_md.Sparse, False))),
-        *(pytest.param(jax_md.OrderedSparse, each, marks=pytest.mark.slow) for each in (True, False)),
-    ],
-)
+MEASURED = [(jax_md.Dense, False), (jax_md.Sparse, True)]
+
+
+@pytest.mark.parametrize(("form", "euclidean"), sparing(itertools.product(FORMATS, (True, False)), MEASURED))
 def test_what_is_no_space_of_ours_is_measured(form, euclidean):
     """A distance that is not Euclidean, or a box that is too small for its nearest images."""
     displacement, box = (functools.partial(nearest, box=np.float64(1.0)), 1.0) if euclidean else (metric, 2.0)
@@ -142,7 +132,7 @@ def test_room():
         assert ((0, 0) in pairs_of(own.idx, N, form)) == (form is not jax_md.OrderedSparse)
 
 
-@pytest.mark.parametrize("form", [jax_md.Dense, jax_md.OrderedSparse, pytest.param(jax_md.Sparse, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("form", [jax_md.Dense, jax_md.OrderedSparse, slow(jax_md.Sparse)])
 def test_masks_come_before_room(form):
     displacement, box, _ = SPACES["periodic"]
     molecule = np.arange(N + 1) // 4
@@ -177,10 +167,8 @@ def test_boxes_that_change():
     assert update(x, nbrs, 0.4 * MATRIX).cell_size_too_small
     with pytest.raises(ValueError, match="box= only with fractional_coordinates=True"):
         jax_md.neighbor_list(None, LENGTHS, CUTOFF).allocate(points(False)).update(points(False), box=LENGTHS)
-    with pytest.raises(TypeError, match=r"update\(\) got perturbation"):
-        nbrs.update(x, perturbation=jnp.eye(3))
-    with pytest.raises(ValueError, match="displacement_or_metric given"):
-        jax_md.neighbor_list(None, 1.0, CUTOFF).allocate(x)
+    refuses(TypeError, r"update\(\) got perturbation", nbrs.update, x, perturbation=jnp.eye(3))
+    refuses(ValueError, "displacement_or_metric given", jax_md.neighbor_list(None, 1.0, CUTOFF).allocate, x)
     with pytest.raises(ValueError, match="format must be a member of NeighborListFormat"):
         jax_md.neighbor_list(None, 1.0, CUTOFF, format="Dense")
     with pytest.raises(TypeError, match=r"cannot run inside jax.jit"):
@@ -245,13 +233,7 @@ def test_the_function_chooses(displacement):
 IMAGES_OFTEN = [(jax_md.Dense, True)]  # pairs one after another, and no fractions: of particles that nobody wrapped
 
 
-@pytest.mark.parametrize(
-    ("form", "fractional"),
-    [
-        pytest.param(form, fractional, marks=[pytest.mark.slow] * ((form, fractional) not in IMAGES_OFTEN))
-        for form, fractional in itertools.product(FORMATS, (True, False))
-    ],
-)
+@pytest.mark.parametrize(("form", "fractional"), sparing(itertools.product(FORMATS, (True, False)), IMAGES_OFTEN))
 def test_several_images(form, fractional):
     matrix, x = MATRIX / 3, points(True, 6)
     given = x if fractional else x @ matrix.T
@@ -272,9 +254,8 @@ def test_several_images(form, fractional):
         else:
             used = np.asarray(nbrs.receivers) < 6
             i, j, s = (np.asarray(part)[used] for part in (nbrs.receivers, nbrs.senders, nbrs.shifts))
-        found = list(zip(i.tolist(), j.tolist(), map(tuple, s.astype(int).tolist())))
-        assert set(found) == within
-        assert len(found) == len(within) == nbrs.n_edges
+        assert as_set(i, j, s) == within
+        assert len(within) == nbrs.n_edges
         assert (nbrs.shifts.dtype, bool(nbrs.did_buffer_overflow)) == (np.int32, False)
     assert update(given, nbrs, 0.2 * matrix).did_buffer_overflow
     assert update(lost, nbrs, matrix).did_buffer_overflow  # though there is room for all that are found
@@ -288,8 +269,7 @@ def test_several_images_by_jax_md_itself(dim, dtype):
     with jax.numpy_dtype_promotion("standard"):
         own = getattr(jax_md, "estimate_max_neighbors", None) and pytest.importorskip("jax_md").custom_partition
         if own is None:
-            with pytest.raises(TypeError, match=r"got \[12, \d\] and .*float\d\d: of others, install jax-md"):
-                fns.allocate(x)
+            refuses(TypeError, r"got \[12, \d\] and .*float\d\d: of others, install jax-md", fns.allocate, x)
             return
         made = own.neighbor_list_multi_image(None, 1.7 * jnp.eye(dim), 1.2, SKIN).allocate(x)
         for nbrs, other in ((fns.allocate(x), made), (fns.update(x + dtype(0.2), fns.allocate(x)), made.update(x + dtype(0.2)))):
@@ -375,7 +355,5 @@ def test_particles_that_nobody_wrapped_are_found():
     form = jax_md.OrderedSparse
     many = jax_md.neighbor_list_multi_image(None, edge * np.eye(3), 1.0, fractional_coordinates=False, format=form).allocate(far)
     used = np.asarray(many.senders) < 60
-    i, j, shifts = (np.asarray(part)[used].astype(int).tolist() for part in (many.receivers, many.senders, many.shifts))
-    found = list(zip(i, j, map(tuple, shifts)))
-    assert len(found) == len(set(found))
-    assert set(found) == {(i, j, s) for i, j, s in expected if s > (0, 0, 0) or (s == (0, 0, 0) and i < j)}
+    found = as_set(*(np.asarray(part)[used] for part in (many.receivers, many.senders, many.shifts)))
+    assert found == {(i, j, s) for i, j, s in expected if s > (0, 0, 0) or (s == (0, 0, 0) and i < j)}

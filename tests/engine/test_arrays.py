@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
+from checked import slow, slowly
 
 import jfrnn
 from jfrnn._engine import arrays, blocks, tuning
@@ -21,7 +22,6 @@ ELSEWHERE = tuning.ACCELERATOR._replace(words=1 << 12, few_pairs=1000, plain_pai
 AT_ONCE = ELSEWHERE._replace(words=1 << 20, few_pairs=1 << 20, plain_pairs=1 << 20)  # all rows and their doubtful pairs
 LOOPS = ELSEWHERE._replace(at_once=0)  # as blocks of many queries are processed
 TIES = ("ulp_far_axis", "queries_fewer")
-SLOW = pytest.mark.slow
 
 
 @pytest.fixture
@@ -33,26 +33,14 @@ def elsewhere(monkeypatch):
     jax.clear_caches()
 
 
-@SLOW
-@pytest.mark.parametrize("name", HARD_CASES)
-def test_numbers_of_accelerators_find_the_same_pairs(name, elsewhere):
-    if name == "denormal_lattice":
-        pytest.skip("its cutoff is refused")
-    given = HARD_CASES[name].build(np.float32, 3)
-    nbrs = checked.search_padded(given, max(704, len(given.positions)), 704, backend="jax")
-    checked.assert_pairs(nbrs, reference.reference_pairs(given.positions, given.cutoff, queries=given.queries))
+NUMBERS = {"elsewhere": ELSEWHERE, "all rows of a block at once": AT_ONCE, "blocks in loops": LOOPS}
+EACH = [("elsewhere", name) for name in HARD_CASES if name != "denormal_lattice"]  # whose cutoff is refused
+EACH += [(numbers, name) for numbers in NUMBERS if numbers != "elsewhere" for name in TIES]
 
 
-@pytest.mark.parametrize(
-    ("name", "numbers"),
-    [
-        (name, numbers) if (name, numbers) == ("lattice_1e-4_at_0", "AT_ONCE") else pytest.param(name, numbers, marks=SLOW)
-        for name in TIES
-        for numbers in ("AT_ONCE", "LOOPS")
-    ],
-)
-def test_all_rows_of_a_block_at_once_and_blocks_in_loops(name, numbers, elsewhere, monkeypatch):
-    monkeypatch.setattr(tuning, "CPU", {"AT_ONCE": AT_ONCE, "LOOPS": LOOPS}[numbers])
+@pytest.mark.parametrize(("numbers", "name"), slowly(*EACH))
+def test_numbers_of_accelerators_find_the_same_pairs(numbers, name, elsewhere, monkeypatch):
+    monkeypatch.setattr(tuning, "CPU", NUMBERS[numbers])
     given = HARD_CASES[name].build(np.float32, 3)
     nbrs = checked.search_padded(given, max(704, len(given.positions)), 704, backend="jax")
     checked.assert_pairs(nbrs, reference.reference_pairs(given.positions, given.cutoff, queries=given.queries))
@@ -64,9 +52,7 @@ LENGTHS = {"images": [1.0, 0.3, 1.0], "nearest images": [1.0, 1.0, 1.0]}
 
 
 @pytest.mark.usefixtures("elsewhere")
-@pytest.mark.parametrize(
-    "kind", ["images", *(pytest.param(kind, marks=SLOW) for kind in ("batch", "half", "nearest images", "a cutoff per particle"))]
-)
+@pytest.mark.parametrize("kind", ["images", *(slow(kind) for kind in ("batch", "half", "nearest images", "a cutoff per particle"))])
 def test_options_with_the_numbers_of_accelerators(kind):
     x, cutoff, lengths, options = SOME, 0.2, LENGTHS.get(kind), {}
     if kind == "a cutoff per particle":
@@ -149,7 +135,7 @@ def spring(r, i, j):
 
 
 @pytest.mark.usefixtures("elsewhere")
-@pytest.mark.parametrize("kind", ["few", pytest.param("many", marks=SLOW), pytest.param("ties", marks=SLOW)])
+@pytest.mark.parametrize("kind", ["few", slow("many"), slow("ties")])
 def test_sums_with_the_numbers_of_accelerators(kind):
     """At once, with more neighbors than that allows, and with more doubtful candidates."""
     rng = np.random.default_rng(2)

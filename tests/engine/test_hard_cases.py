@@ -80,20 +80,15 @@ def test_hard_case(name, dtype, dim, closed, backend):
     checked.assert_pairs(nbrs, expected_pairs(name, dtype, dim, closed))  # the padding is NaN and in no pair
 
 
-def each_size():
-    """Yield sizes, unpadded, each a program of its own: by default of one kind, on Warp some of two, on array engines but one."""
-    empty, others = ("n_0", "no_queries", "no_sources"), ("n_1", "n_2", "n_33", "n_65", "queries_fewer")
-    for name, dtype, dim, backend in product(empty + others, (np.float32, np.float64), (2, 3), BACKENDS):
-        first, second = (dtype, dim) == (np.float32, 3), (dtype, dim) == (np.float64, 2)
-        often = first and (
-            name in empty or backend == "warp" or (name, backend) in (("n_1", "hashgrid"), ("queries_fewer", "hashgrid"))
-        )
-        often |= second and (name, backend) in (("n_33", "jax"), *((name, "warp") for name in ("n_0", "n_1", "queries_fewer")))
-        kind = f"{name}-f{8 * dtype().itemsize}-{dim}d-{backend}"
-        yield pytest.param(name, dtype, dim, backend, id=kind, marks=[] if often else [pytest.mark.slow])
+# Sizes, unpadded, each a program of its own: by default of one kind, on Warp some of two, on array engines but one.
+EMPTY, SOME, OTHERS = ("n_0", "no_queries", "no_sources"), ("n_1", "queries_fewer"), ("n_2", "n_33", "n_65")
+SIZES = list(product(EMPTY + SOME + OTHERS, (np.float32, np.float64), (2, 3), BACKENDS))
+OFTEN = [*product(EMPTY, [np.float32], [3], BACKENDS), *product(SOME, [np.float32], [3], BACKENDS[2:])]
+OFTEN += [*product(OTHERS, [np.float32], [3], ["warp"]), *product(("n_0", *SOME), [np.float64], [2], ["warp"])]
+OFTEN += [("n_33", np.float64, 2, "jax")]
 
 
-@pytest.mark.parametrize(("name", "dtype", "dim", "backend"), list(each_size()))
+@pytest.mark.parametrize(("name", "dtype", "dim", "backend"), checked.sparing(SIZES, OFTEN))
 def test_sizes_as_they_are(name, dtype, dim, backend):
     given = HARD_CASES[name].build(dtype, dim)
     nbrs = jfrnn.search(given.positions, given.cutoff, queries=given.queries, backend=backend)

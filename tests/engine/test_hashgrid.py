@@ -59,14 +59,6 @@ def test_mostly_padding(value, dtype, dim):
     assert jfrnn.Status(int(nbrs.status)) == jfrnn.Status.NONFINITE
 
 
-def test_non_finite_queries():
-    points, queries = np.random.default_rng(3).random((2, 100, 3)).astype(np.float32)
-    queries[7, 1] = np.nan
-    nbrs = jfrnn.search(points, 0.3, queries=queries, backend="hashgrid")
-    checked.assert_exact(nbrs, points, 0.3, queries=queries)
-    assert jfrnn.Status(int(nbrs.status)) == jfrnn.Status.NONFINITE
-
-
 def test_sizes_and_cutoffs_take_turns():
     """The grid of one shape serves all: nothing of the last search may be left in it."""
     for n, cutoff in [(900, 0.1), (3, 2.0), (1000, 0.05), (1, 1.0), (900, 0.2)]:

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
+from checked import slow, slowly, sparing
 
 import jfrnn
 from jfrnn._engine import ARRAYS
@@ -39,7 +40,6 @@ LISTS = {
 CAPACITY = {"half short vectors": 640}  # given: a program that counts would be compiled besides
 REVERSED = ("half", "queries")
 N, ASKING, CUTOFF = 90, 31, 0.3
-SLOW = pytest.mark.slow
 
 
 def by_arrays(nbrs):
@@ -94,10 +94,7 @@ OFTEN = [("open", np.float64), ("nearest", np.float64), ("half images", np.float
 OFTEN += [("gather", np.float32), ("both", np.float32)]
 
 
-@pytest.mark.parametrize(
-    ("name", "dtype"),
-    [pytest.param(*each, marks=[SLOW] * (each not in OFTEN)) for each in product(LISTS, (np.float32, np.float64))],
-)
+@pytest.mark.parametrize(("name", "dtype"), sparing(product(LISTS, (np.float32, np.float64)), OFTEN))
 def test_pairs_at_new_positions(name, dtype):
     nbrs, x, q = made(name, dtype)
     found = nbrs.vectors(x, queries=q)
@@ -111,9 +108,7 @@ LATTICES += [(np.float64, *kind, scale) for kind in ((2, True), (3, False)) for 
 EVERY = product((np.float32, np.float64), (2, 3), (False, True), SCALES)
 
 
-@pytest.mark.parametrize(
-    ("dtype", "dim", "closed", "scale"), [pytest.param(*given, marks=[SLOW] * (given not in LATTICES)) for given in EVERY]
-)
+@pytest.mark.parametrize(("dtype", "dim", "closed", "scale"), sparing(EVERY, LATTICES))
 def test_ties_are_decided_exactly(scale, dtype, dim, closed):
     """All points on a lattice, in a list of all of them: rows full of pairs at exactly the cutoff, or as near as floats allow."""
     grid = np.stack(np.meshgrid(*[np.arange(4)] * dim, indexing="ij"), -1).reshape(-1, dim)
@@ -130,7 +125,7 @@ def test_ties_are_decided_exactly(scale, dtype, dim, closed):
 
 @pytest.mark.parametrize(
     ("dtype", "length"),
-    [(np.float32, 4.0), (np.float32, 5.0), (np.float64, 4.0), pytest.param(np.float64, 5.0, marks=SLOW)],
+    [(np.float32, 4.0), (np.float32, 5.0), (np.float64, 4.0), slow(np.float64, 5.0)],
     ids=["f32-4.0", "f32-5.0", "f64-4.0", "f64-5.0"],
 )
 def test_ties_of_images_are_decided_exactly(length, dtype):
@@ -154,10 +149,6 @@ RNG = np.random.default_rng(1)
 VALUES = {"m": RNG.random(N), "v": RNG.random((N, 3)), "k": np.arange(N, dtype=np.int32)}
 
 
-def energy_of(sums, sin=jnp.sin):
-    return (sums["a"] ** 2).sum() + sin(sums["b"]).sum()
-
-
 def everything(nbrs, x, q, twice, compensated=False):
     """Return displacements, the mask, and sums with their derivatives: of first order, and (`twice`) those along a motion, too."""
     mine = None if q is None else {"m": VALUES["m"][:ASKING]}
@@ -167,7 +158,7 @@ def everything(nbrs, x, q, twice, compensated=False):
             lambda r, i, j: {key: scale * y if key != "c" else y.astype(r.dtype) for key, y in summand(r, i, j).items()},
             x, None, {**VALUES, "m": m}, neighbors=nbrs, queries=q, query_values=mine, compensated=compensated,
         )  # fmt: skip
-        return energy_of(sums), sums
+        return (sums["a"] ** 2).sum() + jnp.sin(sums["b"]).sum(), sums
 
     @jax.jit
     def all_of(x, m, scale, q):
@@ -205,52 +196,27 @@ def expected_of(name, x, q, twice):
     return (slopes(x), by_numpy.along(slopes, x, np.cos(x))) if twice else slopes(x)
 
 
-def assert_close(found, expected):
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-11), found, expected)
+WAYS = [(name, "kernels", True) for name in ("images", "either")]  # second derivatives of the others by hand
+WAYS += [("skewed images", "kernels", False), ("queries", "compensated", False), ("skewed images", "arrays", True)]
+MORE = [("scatter", "compensated", False), ("half mean", "arrays", False)]
+MORE += [(name, "compensated", True) for name in ("images", "scatter", "queries")]
+MORE += [each for each in product(LISTS, ("kernels", "arrays"), (True,)) if each not in WAYS]
 
 
-TWICE = ("images", "either")  # second derivatives of the others by hand
-ONCE = ("skewed images",)  # and of kinds that are like this one, sums, too
-SUMMED = [(name, False, True) for name in TWICE] + [(name, False, False) for name in ONCE]
-SUMMED += [("queries", True, False)]
-MORE = (
-    [("scatter", True, False)]
-    + [(name, False, True) for name in LISTS if name not in TWICE]
-    + [(name, True, True) for name in ("images", "scatter", "queries")]
-)
-
-
-@pytest.mark.parametrize(("name", "compensated", "twice"), [*SUMMED, *(pytest.param(*more, marks=SLOW) for more in MORE)])
-def test_sums_and_derivatives(name, compensated, twice):
+@pytest.mark.parametrize(("name", "way", "twice"), [*WAYS, *slowly(*MORE)])
+def test_sums_and_derivatives(name, way, twice):
     """Of first order, and where kinds of lists differ in how pairs are passed on (`twice`) of second order."""
     nbrs, x, q = made(name)
-    found, sums = everything(nbrs, x, q, twice, compensated)
+    found, sums = everything(by_arrays(nbrs) if way == "arrays" else nbrs, x, q, twice, way == "compensated")
     assert_pairs(name, nbrs, found, x, q)
-    assert_close(sums, expected_of(name, x, q, twice))
+    expected = expected_of(name, x, q, twice)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-11), sums, expected)
 
 
-@pytest.mark.parametrize(
-    ("name", "twice"),
-    [
-        ("skewed images", True),
-        pytest.param("half mean", False, marks=SLOW),
-        *(pytest.param(name, True, marks=SLOW) for name in LISTS if name != "skewed images"),
-    ],
-)
-def test_array_programs_find_and_sum_the_same(name, twice):
-    nbrs, x, q = made(name)
-    found, sums = everything(by_arrays(nbrs), x, q, twice)
-    assert_pairs(name, nbrs, found, x, q)
-    assert_close(sums, expected_of(name, x, q, twice))
+EXTREMES = product(("open", "images", "queries"), ("min", "max"))
 
 
-@pytest.mark.parametrize(
-    ("name", "reduce"),
-    [
-        *(("images", "min"), ("queries", "max")),
-        *(pytest.param(*more, marks=SLOW) for more in (("open", "max"), ("open", "min"), ("images", "max"), ("queries", "min"))),
-    ],
-)
+@pytest.mark.parametrize(("name", "reduce"), sparing(EXTREMES, [("images", "min"), ("queries", "max")]))
 def test_extremes(name, reduce):
     nbrs, x, q = made(name)
 
@@ -270,25 +236,6 @@ def test_extremes(name, reduce):
     of_x = by_numpy.pull(pairs, np.where(chosen, 18 * np.sin(9 * r) * np.cos(9 * r), 0), x, q)
     np.testing.assert_allclose(found, expected, rtol=1e-13)
     np.testing.assert_allclose(slopes, of_x if q is None else of_x[0], rtol=1e-12, atol=1e-13)
-
-
-@pytest.mark.parametrize("name", ["nearest", "half images"])
-def test_symmetry(name):
-    """A function of i < j, or of a forward image, whose value the other end gets, too, or its negative."""
-    nbrs, x, _ = made(name)
-
-    @jax.jit
-    def both(x):
-        return [
-            jfrnn.pair_sum(lambda r, i, j: r * jnp.sum(r**4), x, None, neighbors=nbrs, symmetry=symmetry)
-            for symmetry in ("symmetric", "antisymmetric")
-        ]
-
-    pairs = by_numpy.in_order(by_numpy.forward(oracle(name, x)), 3)
-    r = by_numpy.vectors_of(pairs, np.asarray(x), np.asarray(x), np.diag(box_of(name, np.float64)))
-    terms = r * (r**4).sum(1)[:, None]
-    of_i, of_j = (by_numpy.add_up(terms, where, N) for where in (pairs.i, pairs.j))
-    np.testing.assert_allclose(both(x), [of_i + of_j, of_i - of_j], atol=1e-15)
 
 
 def test_in_two_dimensions_and_single_precision():
@@ -312,11 +259,8 @@ def test_in_two_dimensions_and_single_precision():
 def test_the_kernel_sums():
     """The program has a call of the library and no loop of array programming."""
     nbrs, x, _ = made("nearest")
-    text = (
-        jax.jit(jax.grad(lambda x: jnp.sum(jfrnn.pair_sum(lambda r, i, j: jnp.sum(r**4), x, None, neighbors=nbrs))))
-        .lower(x)
-        .as_text()
-    )
+    slopes = jax.jit(jax.grad(lambda x: jnp.sum(jfrnn.pair_sum(lambda r, i, j: jnp.sum(r**4), x, None, neighbors=nbrs))))
+    text = slopes.lower(x).as_text()
     assert "jfrnn_kept_sums" in text
     assert "stablehlo.while" not in text
 
@@ -339,20 +283,7 @@ def test_what_has_no_translation_warns_once():
     np.testing.assert_allclose(sums, by_numpy.add_up(terms, pairs.i, N), rtol=1e-12)
 
 
-def test_vmap():
-    nbrs, x, _ = made("half images")
-
-    def slopes(x):
-        return jax.grad(lambda x: jnp.sum(jfrnn.pair_sum(lambda r, i, j: jnp.sum(r**4), x, None, neighbors=nbrs)))(x)
-
-    several = np.stack([x, x + 0.002 * np.cos(np.arange(N))[:, None]])
-    for found, x in zip(jax.jit(jax.vmap(slopes))(several), several, strict=True):
-        pairs = by_numpy.in_order(oracle("half images", x), 3)
-        r = by_numpy.vectors_of(pairs, x, x, np.diag(box_of("half images", np.float64)))
-        np.testing.assert_allclose(found, by_numpy.pull(pairs, 4 * r**3, x), rtol=1e-12, atol=1e-13)
-
-
-@pytest.mark.parametrize("dtype", [pytest.param(np.float32, marks=SLOW), np.float64])
+@pytest.mark.parametrize("dtype", [slow(np.float32), np.float64])
 def test_particles_that_are_not_finite(dtype):
     nbrs, x, _ = made("nearest", dtype)
     x = np.array(x)

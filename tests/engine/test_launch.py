@@ -164,16 +164,7 @@ class Native:
         return self.library
 
     def call(self, name, x=0, y=0, *, device=0, cuda=True, stage=EXECUTE, extension=0):
-        kinds = (
-            ctypes.c_char_p,
-            ctypes.c_int,
-            ctypes.c_int,
-            ctypes.c_int,
-            ctypes.c_void_p,
-            ctypes.c_void_p,
-            ctypes.c_int,
-            ctypes.c_int,
-        )
+        kinds = ctypes.c_char_p, *3 * [ctypes.c_int], *2 * [ctypes.c_void_p], *2 * [ctypes.c_int]
         call = ctypes.CFUNCTYPE(ctypes.c_char_p, *kinds)(self.library.address_of("call"))
         return call(name.encode(), len(name), device, cuda, x, y, stage, extension)
 
@@ -207,13 +198,8 @@ def test_launches_get_numbers_of_the_plan_and_addresses_of_the_call(native):
 
 
 def test_what_may_run_beside_the_one_before_waits_for_what_came_before_both(native):
-    steps = [
-        native.step(1),
-        native.step(2, numbers={"number": 2}),
-        native.step(3, numbers={"number": 3}, beside=True),
-        native.step(4),
-    ]
-    native.keep("beside@", 0, Plan(steps, {"number": 1}))
+    numbered = native.step(2, numbers={"number": 2}), native.step(3, numbers={"number": 3}, beside=True)
+    native.keep("beside@", 0, Plan([native.step(1), *numbered, native.step(4)], {"number": 1}))
     assert native.call("beside@", 1000) is None
     both = [launched(99, 1000, 2, 1), launched(7, 1000, 3, 1)]
     before, after = [(RECORD, 99, 71, 0), (WAIT, 7, 71, 0)], [(RECORD, 7, 72, 0), (WAIT, 99, 72, 0)]
@@ -354,56 +340,34 @@ def test_a_program_for_cuda_is_made_ready_on_a_device_of_the_process(monkeypatch
     assert laid == [3]
 
 
-class Driver:
-    """A driver of CUDA that has one device, and loads whatever begins as it should."""
+def make_driver(loaded, contexts):
+    """Return a driver of CUDA that has one device, and loads whatever begins as it should, noting what, and in which context."""
 
-    def __init__(self):
-        self.loaded, self.contexts = [], []
-
-    def cuInit(self, _):
-        return 0
-
-    def cuDriverGetVersion(self, found):
-        return self.put(found, 13000)
-
-    def cuDeviceGet(self, found, number):
-        return self.put(found, number)
-
-    def cuDevicePrimaryCtxRetain(self, found, _):
-        return self.put(found, 0x100)
-
-    def cuDeviceGetAttribute(self, found, kind, _):
-        return self.put(found, {16: 132, 75: 9, 76: 0}[kind])
-
-    def cuCtxPushCurrent_v2(self, context):
-        self.contexts.append(context)
-        return 0
-
-    def cuCtxPopCurrent_v2(self, _):
-        self.contexts.pop()
-        return 0
-
-    def cuModuleLoadData(self, found, binary):
-        self.loaded.append((binary, list(self.contexts)))
-        return 200 if b"broken" in binary else self.put(found, 0x200)
-
-    def cuModuleGetFunction(self, found, module, name):
-        return self.put(found, module + len(name))
-
-    def cuCtxSynchronize(self):
-        return 0
-
-    def cuModuleUnload(self, _):
-        return 0
-
-    def put(self, found, value):
+    def put(found, value):
         found._obj.value = value
         return 0
+
+    def load(found, binary):
+        loaded.append((binary, list(contexts)))
+        return 200 if b"broken" in binary else put(found, 0x200)
+
+    return types.SimpleNamespace(
+        **dict.fromkeys(("cuInit", "cuCtxSynchronize", "cuModuleUnload"), lambda *_: 0),
+        cuDriverGetVersion=lambda found: put(found, 13000),
+        cuDeviceGet=put,
+        cuDevicePrimaryCtxRetain=lambda found, _: put(found, 0x100),
+        cuDeviceGetAttribute=lambda found, kind, _: put(found, {16: 132, 75: 9, 76: 0}[kind]),
+        cuCtxPushCurrent_v2=lambda context: contexts.append(context) or 0,
+        cuCtxPopCurrent_v2=lambda _: 0 * contexts.pop(),
+        cuModuleLoadData=load,
+        cuModuleGetFunction=lambda found, module, name: put(found, module + len(name)),
+    )
 
 
 def test_a_program_for_cuda_that_is_kept_is_loaded_without_warp(monkeypatch, tmp_path):
     """Warp is started to compile alone: where nothing is kept, or what is kept cannot be loaded."""
-    driver, started = Driver(), []
+    loaded, contexts, started = [], [], []
+    driver = make_driver(loaded, contexts)
     monkeypatch.setattr(_driver, "driver", lambda: driver)
     monkeypatch.setattr(_compile, "_folders", lambda: [tmp_path])
     monkeypatch.setattr(_driver, "find_device", _driver.find_device.__wrapped__)
@@ -421,8 +385,8 @@ def test_a_program_for_cuda_that_is_kept_is_loaded_without_warp(monkeypatch, tmp
         assert library.address_of("twelve chars") == 0x20C
         del library
     assert started == ["start"]
-    assert driver.loaded == [(b".entry kept(", [0x100])] * 2
+    assert loaded == [(b".entry kept(", [0x100])] * 2
     with pytest.raises(RuntimeError, match="cannot be loaded"):
         _compile.load(Program("broken", "broken", cuda=True), "cuda:1", "start")
     assert started == ["start"] * 3
-    assert driver.contexts == []
+    assert contexts == []

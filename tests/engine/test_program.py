@@ -3,6 +3,7 @@
 import re
 
 import pytest
+from checked import refuses
 
 from jfrnn._engine.start import load_warp
 from jfrnn.kernels import Field, _compile, declare
@@ -42,21 +43,8 @@ def test_arguments_that_are_derived_stand_behind_those_of_their_bases():
 @pytest.mark.parametrize(
     "line",
     [
-        "int* const a;",
-        "int a[3];",
-        "int a = 1;",
-        "int a; int b;",
-        "int a, /* two */ b;",
-        "int **a;",
-        "int& a;",
-        "int a : 3;",
-        "unsigned int a;",
-        "long long a;",
-        "real a;",
-        "const real *a, b;",
-        "int a,",
-        "#if DIM > 2",
-        "struct { int a; };",
+        *("int* const a;", "int a[3];", "int a = 1;", "int a; int b;", "int a, /* two */ b;", "int **a;", "int& a;", "int a : 3;"),
+        *("unsigned int a;", "long long a;", "real a;", "const real *a, b;", "int a,", "#if DIM > 2", "struct { int a; };"),
     ],
 )
 def test_what_is_no_array_and_no_integer_is_refused(line):
@@ -71,15 +59,13 @@ def test_the_compiler_refuses_arguments_that_were_not_read():
     assert read_fields(text, "WorkArguments") == ((Field("n", 0, False),), 8)
     (kernel,) = declare("hidden", text + KERNEL.format(), "Work.run")
     load_warp()
-    with pytest.raises(RuntimeError, match="does not compile"):
-        _compile.load(kernel.program)
+    refuses(RuntimeError, "does not compile", _compile.load, kernel.program)
 
 
 def test_integers_that_are_missing_or_too_large_are_refused():
     (kernel,) = declare("numbers", struct("int *a;", "int n, m;") + KERNEL.format(), "Work.run")
     assert kernel.pack({"n": -1, "m": 2**31 - 1}) == bytes(8) + b"\xff" * 7 + b"\x7f"
-    with pytest.raises(ValueError, match="the argument 'm' of the kernel Work_run is missing"):
-        kernel.pack({"n": 1})
+    refuses(ValueError, "the argument 'm' of the kernel Work_run is missing", kernel.pack, {"n": 1})
     for wrong in (2**31, -(2**31) - 1):
         with pytest.raises(ValueError, match=f"the argument 'm' of the kernel Work_run must be an integer of 32 bits, got {wrong}"):
             kernel.pack({"n": 1, "m": wrong})

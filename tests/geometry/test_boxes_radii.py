@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 import reference
 from by_numpy import in_order
+from checked import slow, sparing
 from test_box import masked_images, pull_back
 from test_boxes import box_of, listed_images, system_by_system
+from test_search_edges import edges_as_set
 
 import jfrnn
 from jfrnn._geometry.cutoffs import RULES
@@ -78,17 +80,11 @@ def scene(name, dtype, dim, who):
     return Scene(name, dtype, dim, who)
 
 
-def each_case():
-    """Yield every case, rule, kind and engine; by default one on Warp, since others take long to compile."""
-    often = {("queries", "mean", np.float32, 3, "warp")}
-    kinds = product(CRYSTAL_CASES, (*RULES, "table"), (np.float32, np.float64), (2, 3), ("warp", "jax", "brute"))
-    for name, who, dtype, dim, backend in kinds:
-        kind = f"{name}-{who}-f{8 * dtype().itemsize}-{dim}d-{backend}"
-        marks = [] if (name, who, dtype, dim, backend) in often else [SLOW]
-        yield pytest.param(name, who, dtype, dim, backend, id=kind, marks=marks)
+KINDS = list(product(CRYSTAL_CASES, (*RULES, "table"), (np.float32, np.float64), (2, 3), ("warp", "jax", "brute")))
+OFTEN = [("queries", "mean", np.float32, 3, "warp")]  # others take long to compile
 
 
-@pytest.mark.parametrize(("name", "who", "dtype", "dim", "backend"), list(each_case()))
+@pytest.mark.parametrize(("name", "who", "dtype", "dim", "backend"), sparing(KINDS, OFTEN))
 def test_case(name, who, dtype, dim, backend):
     given = scene(name, dtype, dim, who)
     nbrs = given.search(backend, capacity=CAPACITY[dim])
@@ -100,8 +96,8 @@ def test_case(name, who, dtype, dim, backend):
     assert len(expected) > 0 and nbrs.backend == backend
 
 
-@pytest.mark.parametrize("backend", ["warp", pytest.param("jax", marks=SLOW), pytest.param("brute", marks=SLOW)])
-@pytest.mark.parametrize("who", ["table", pytest.param("either", marks=SLOW)])
+@pytest.mark.parametrize("backend", ["warp", slow("jax"), slow("brute")])
+@pytest.mark.parametrize("who", ["table", slow("either")])
 def test_options_and_flat_lists(who, backend):
     given = scene("mixed", np.float32, 2, who)
     exclude = np.random.default_rng(2).integers(0, len(given.x), (40, 2))
@@ -109,11 +105,7 @@ def test_options_and_flat_lists(who, backend):
     flat = given.search(backend, jfrnn.search_edges, half=True, closed=True, exclude=exclude, total=1024)
     flat.check()
     edges = jax.jit(lambda flat, x: flat.edges(x))(flat, given.x)
-    receivers, senders, shifts = (
-        np.asarray(part)[np.asarray(edges.mask)] for part in (edges.receivers, edges.senders, edges.shift)
-    )
-    assert int(edges.pair_count) == len(expected) == len(senders)
-    assert set(zip(receivers.tolist(), senders.tolist(), map(tuple, shifts.tolist()), strict=True)) == expected
+    assert edges_as_set(edges) == expected
     if backend == "warp" and who == "either":
         nbrs = given.search(backend, half=True, exclude=exclude)
         assert masked_images(nbrs, given.x) == reference.without_excluded(given.pairs(half=True), exclude)
@@ -156,7 +148,7 @@ WAYS = [("mean", "warp", "search")]
 MORE = [(who, backend, way) for who in (*RULES, "table") for backend in ("warp", "jax", "brute") for way in ("search", "list")]
 
 
-@pytest.mark.parametrize(("who", "backend", "way"), [*WAYS, *(pytest.param(*x, marks=SLOW) for x in MORE if x not in WAYS)])
+@pytest.mark.parametrize(("who", "backend", "way"), [*WAYS, *(slow(*x) for x in MORE if x not in WAYS)])
 def test_sums_and_derivatives_in_positions_and_boxes(who, backend, way):
     """Sums over the oracle's pairs, their gradient, and with a table that of its norm, by a complex step."""
     given = scene("mixed", np.float64, 2, who)
@@ -202,7 +194,7 @@ def test_sums_and_derivatives_in_positions_and_boxes(who, backend, way):
         np.testing.assert_allclose(along, right, rtol=1e-9)
 
 
-@pytest.mark.parametrize("backend", ["warp", pytest.param("jax", marks=SLOW)])
+@pytest.mark.parametrize("backend", ["warp", slow("jax")])
 def test_what_is_wrong_sets_bits_and_absent_particles_may_have_any_cutoff(backend):
     given = scene("absent", np.float32, 2, "either")
     gone, radii = given.given.batch < 0, given.cutoff.copy()

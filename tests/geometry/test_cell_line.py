@@ -14,11 +14,6 @@ from jfrnn._geometry.images import Images
 CUTOFF = 0.1
 
 
-def line_of(x, sources):
-    axes = open_axes(cell_edge(jnp.asarray(CUTOFF, x.dtype)), x.shape[1])
-    return cell_line.sort_along_line(jnp.asarray(x.T), axes, sources, None)
-
-
 def runs_of(line, cells, queries, images=None):
     """Return the sources along the line, twice, and the runs of queries."""
     return line.twice(), *cell_line.line_runs(line, cells.of(jnp.asarray(queries)), images)
@@ -27,7 +22,8 @@ def runs_of(line, cells, queries, images=None):
 @functools.partial(jax.jit, static_argnums=1)
 def runs_along_line(x, sources, queries):
     """Sort and look up in one program, which scenes of the same shape share."""
-    return runs_of(*line_of(x, sources), queries)
+    axes = open_axes(cell_edge(jnp.asarray(CUTOFF, x.dtype)), x.shape[1])
+    return runs_of(*cell_line.sort_along_line(x.T, axes, sources, None), queries)
 
 
 def candidates(twice, start, stop, code):

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
+from checked import slow, sparing
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
@@ -44,11 +45,7 @@ OFTEN = [("warp", np.float32), ("warp", np.float64), ("hashgrid", np.float32)]  
 @hypothesis.settings(max_examples=50, deadline=None)
 @hypothesis.given(st.data())
 @pytest.mark.parametrize(
-    ("backend", "dtype"),
-    [
-        pytest.param(*each, marks=[pytest.mark.slow] * (each not in OFTEN))
-        for each in itertools.product(("warp", "hashgrid", "jax", "brute"), (np.float32, np.float64))
-    ],
+    ("backend", "dtype"), sparing(itertools.product(("warp", "hashgrid", "jax", "brute"), (np.float32, np.float64)), OFTEN)
 )
 def test_any_floats(backend, dtype, data):
     points = data.draw(hnp.arrays(dtype, (POINTS, 3), elements=floats(dtype)))
@@ -114,7 +111,7 @@ def assert_signs(found, exact, known):
     np.testing.assert_array_equal(integer, exact)
 
 
-@pytest.mark.parametrize("offset", [0.0, pytest.param(-3.0, marks=pytest.mark.slow), 1e4])
+@pytest.mark.parametrize("offset", [0.0, slow(-3.0), 1e4])
 def test_every_step_agrees_with_fractions(dtype, offset):
     a, b = ulp_pairs(dtype, seed=5, offset=offset)
     exact = np.array(
@@ -126,15 +123,11 @@ def test_every_step_agrees_with_fractions(dtype, offset):
 
 
 LATTICES = list(itertools.product((1.0, 2.0**-22, 2.0**39), (True, False), (np.float32, np.float64)))
-OFTEN_IN_LATTICES = [
-    each for each in LATTICES if each[2] is np.float32 and each[1] is (each[0] == 1)
-]  # the wide integers of float64 take long to compile
+# The wide integers of float64 take long to compile.
+OFTEN_IN_LATTICES = [each for each in LATTICES if each[2] is np.float32 and each[1] is (each[0] == 1)]
 
 
-@pytest.mark.parametrize(
-    ("size", "orthogonal", "dtype"),
-    [pytest.param(*each, marks=[pytest.mark.slow] * (each not in OFTEN_IN_LATTICES)) for each in LATTICES],
-)
+@pytest.mark.parametrize(("size", "orthogonal", "dtype"), sparing(LATTICES, OFTEN_IN_LATTICES))
 def test_steps_agree_in_lattices(size, orthogonal, dtype):
     """Ties and near ties on a coarse lattice of points, far from the origin too, with images a few to a thousand cells away."""
     rng = np.random.default_rng(11)
@@ -219,13 +212,3 @@ def test_exact_ties_are_known_without_integers(dtype):
     b = a + np.array([1.0, 2.0, 2.0], dtype)
     sign = signs_in_open_space(a, b, make_cutoff(3.0, np.dtype(dtype), closed=False))[0]
     np.testing.assert_array_equal(sign, np.zeros(256))
-
-
-def test_pairs_are_symmetric(dtype):
-    """Of shuffled pairs near the cutoff, (i, j) is listed if and only if (j, i) is."""
-    points = np.concatenate(ulp_pairs(dtype, seed=7, count=300, scale=0.1))
-    i, j = jfrnn.search(points, 0.1).pairs()
-    near = np.zeros((600, 600), bool)
-    near[i, j] = True
-    assert near.sum() == len(i) > 1000
-    np.testing.assert_array_equal(near, near.T)

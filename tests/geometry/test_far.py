@@ -1,6 +1,7 @@
 """Particles that nobody wrapped, any number of boxes away: against the oracle, on all that a list and a sum tell."""
 
 from fractions import Fraction
+from itertools import product
 
 import by_numpy
 import jax
@@ -8,6 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
+from checked import slots_as_set, slow, sparing
+from test_search_edges import edges_as_set
 
 import jfrnn
 from jfrnn._geometry.far import move_near
@@ -15,7 +18,6 @@ from jfrnn._geometry.images import LARGEST_TURN, images_of
 from jfrnn._geometry.lattice import make_lattice
 from jfrnn._geometry.wrapping import count_turns, unpack_turns
 
-SLOW = pytest.mark.slow
 N, CUTOFF = 24, 1.0
 CELLS = {
     "lengths": [10.0, 9.0, 7.0],
@@ -25,17 +27,12 @@ CELLS = {
     "fcc": [[0, 1.8, 1.8], [1.8, 0, 1.8], [1.8, 1.8, 0]],
 }
 # What each case of the default run tells, one program each; those by hand tell all.
-ASKED = {("short", "warp", 5000, np.float64): ("count", "sums", "sums of the list"), ("fcc", "warp", 500, np.float32): ("edges",)}
+ASKED = {("short", 5000, "warp", np.float64): ("count", "sums", "sums of the list"), ("fcc", 500, "warp", np.float32): ("edges",)}
 ALL = ("count", "sums", "sums of the list", "edges", "edges of the list")
 
 
-def each_case():
-    for cell in CELLS:
-        for backend in ("warp", "jax", "brute"):
-            for far in (200, 500) if cell == "fcc" else (200, 700, 5000, 400_000):
-                for dtype in (np.float32, np.float64):
-                    kind = cell, backend, far, dtype
-                    yield pytest.param(*kind, marks=[] if kind in ASKED else [SLOW])
+AWAY = [(cell, far) for cell in CELLS for far in ((200, 500) if cell == "fcc" else (200, 700, 5000, 400_000))]
+KINDS = [(*away, *kind) for away, kind in product(AWAY, product(("warp", "jax", "brute"), (np.float32, np.float64)))]
 
 
 def scene(cell, far, dtype, seed=0):
@@ -48,23 +45,11 @@ def scene(cell, far, dtype, seed=0):
     return x, matrix
 
 
-def triples(first, second, shifts, mask):
-    where = np.nonzero(np.asarray(mask))
-    named = (np.asarray(first)[where].tolist(), np.asarray(second)[where].tolist(), map(tuple, np.asarray(shifts)[where].tolist()))
-    found = list(zip(*named, strict=True))
-    assert len(set(found)) == len(found)
-    return set(found)
-
-
-def ends_of(edges):
-    return triples(edges.receivers, edges.senders, edges.shift, edges.mask)
-
-
-@pytest.mark.parametrize(("cell", "backend", "far", "dtype"), list(each_case()))
-def test_pairs_shifts_and_sums(cell, backend, far, dtype):
+@pytest.mark.parametrize(("cell", "far", "backend", "dtype"), sparing(KINDS, ASKED))
+def test_pairs_shifts_and_sums(cell, far, backend, dtype):
     x, matrix = scene(cell, far, dtype)
     expected = reference.reference_images(x, CUTOFF, matrix=matrix, periodic=(True,) * len(matrix))
-    count, asked = np.bincount([i for i, *_ in expected], minlength=N), ASKED.get((cell, backend, far, dtype), ALL)
+    count, asked = np.bincount([i for i, *_ in expected], minlength=N), ASKED.get((cell, far, backend, dtype), ALL)
     options = {"box": jfrnn.Box(np.asarray(CELLS[cell], dtype)), "backend": backend}
     one = lambda r, i, j: jnp.ones((), dtype)  # noqa: E731
     tell = {
@@ -82,11 +67,10 @@ def test_pairs_shifts_and_sums(cell, backend, far, dtype):
 
     nbrs, (vectors, mask), shifts, told = all_of(x)
     nbrs.check()
-    rows = np.broadcast_to(np.arange(N)[:, None], nbrs.idx.shape)
-    assert triples(rows, nbrs.idx, shifts, mask) == expected
+    assert slots_as_set(nbrs.idx, mask, shifts) == expected
     for name, found in told.items():
         if "edges" in name:
-            assert ends_of(found) == expected
+            assert edges_as_set(found) == expected
         else:
             np.testing.assert_array_equal(found, count)
     exact = [Fraction(v) for v in matrix.astype(float).reshape(-1).tolist()]
@@ -109,8 +93,7 @@ def test_a_list_with_a_skin_follows_them_and_wrapping_is_no_motion():
     for step, moved in enumerate((x, x + 0.02 * rng.normal(size=x.shape), x % np.diag(matrix), x + 300 * np.diag(matrix))):
         nbrs = nbrs.update(moved)
         expected = reference.reference_images(moved, CUTOFF, matrix=matrix, periodic=(True,) * 3)
-        rows = np.broadcast_to(np.arange(N)[:, None], nbrs.idx.shape)
-        assert triples(rows, nbrs.idx, nbrs.shifts(moved), nbrs.distances(moved)[1]) == expected, step
+        assert slots_as_set(nbrs.idx, nbrs.distances(moved)[1], nbrs.shifts(moved)) == expected, step
     assert int(nbrs.rebuild_count) <= 1
 
 
@@ -134,12 +117,11 @@ def test_boxes_of_systems():
 
     nbrs, shifts, mask = all_of(both)
     nbrs.check()
-    rows = np.broadcast_to(np.arange(2 * N)[:, None], nbrs.idx.shape)
     expected = set()
     for k, (points, matrix) in enumerate(((x, first), (y, second))):
         found = reference.reference_images(points, CUTOFF, matrix=matrix, periodic=(True,) * 3)
         expected |= {(i + k * N, j + k * N, shift) for i, j, shift in found}
-    assert triples(rows, nbrs.idx, shifts, mask) == expected
+    assert slots_as_set(nbrs.idx, mask, shifts) == expected
 
 
 def test_derivatives_in_positions_and_box():
@@ -194,7 +176,7 @@ def test_what_lies_beyond_sets_a_bit():
     assert status(2.7 * 400, skewed) == jfrnn.Status.OK
 
 
-@pytest.mark.parametrize("backend", ["warp", *(pytest.param(name, marks=SLOW) for name in ("jax", "brute"))])
+@pytest.mark.parametrize("backend", ["warp", *(slow(name) for name in ("jax", "brute"))])
 def test_in_skewed_cells_those_that_rounding_would_move_are_named(backend):
     """Beyond 511 vectors, points are taken whose move is exact; the others have no neighbors, and the error names one."""
     x, matrix = scene("fcc", 700, np.float32)

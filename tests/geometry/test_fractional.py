@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import reference
 from by_numpy import in_order
+from checked import as_set, slow
 from test_box import image_pairs, masked_images, pull_back
 from test_boxes import oracle as oracle_of_systems
 
@@ -15,7 +16,6 @@ import jfrnn
 import jfrnn.distributed
 from jfrnn._search.geometry import real_points
 
-SLOW = pytest.mark.slow
 SKEWED = np.array([[1.0, 0.0, 0.0], [0.45, 0.9, 0.0], [-0.3, 0.35, 1.1]])
 BOXES = {
     "skewed": (SKEWED, True, 0.7),
@@ -70,7 +70,7 @@ OFTEN = [("skewed", np.float32, "warp")]
 ALL = [(name, dtype, backend) for name in BOXES for dtype in (np.float32, np.float64) for backend in ("warp", "jax", "brute")]
 
 
-@pytest.mark.parametrize(("name", "dtype", "backend"), [*OFTEN, *(pytest.param(*x, marks=SLOW) for x in ALL if x not in OFTEN)])
+@pytest.mark.parametrize(("name", "dtype", "backend"), [*OFTEN, *(slow(*x) for x in ALL if x not in OFTEN)])
 def test_lists_and_flat_lists(name, dtype, backend):
     (vectors, periodic, cutoff), u, q = BOXES[name], points(dtype), points(dtype, 1, 7)
     real, asking = exact(u, vectors, dtype), exact(q, vectors, dtype)
@@ -79,18 +79,14 @@ def test_lists_and_flat_lists(name, dtype, backend):
     expected = reference.reference_images(real, cutoff, matrix=vectors, periodic=flags)
     nbrs = jfrnn.search(u, cutoff, capacity=CAPACITY, **given)
     nbrs.check()
-    if nbrs.images is not None:
-        assert image_pairs(nbrs, u) == expected
-    else:
-        assert masked_images(nbrs, u) == expected
+    assert (masked_images if nbrs.images is None else image_pairs)(nbrs, u) == expected
     nodes = jax.jit(lambda nbrs, u: nbrs.to_jraph(u, 2048).nodes)(nbrs, u)
     np.testing.assert_array_equal(nodes["positions"][:N], real)
     flat = jfrnn.search_edges(u, cutoff, half=True, total=2048, **given)
     flat.check()
     edges = jax.jit(lambda flat, u: flat.edges(u))(flat, u)
     i, j, s, v = (np.asarray(x)[np.asarray(edges.mask)] for x in (edges.receivers, edges.senders, edges.shift, edges.displacement))
-    half = reference.reference_images(real, cutoff, matrix=vectors, periodic=flags, half=True)
-    assert set(zip(i.tolist(), j.tolist(), map(tuple, s.tolist()), strict=True)) == half
+    assert as_set(i, j, s) == reference.reference_images(real, cutoff, matrix=vectors, periodic=flags, half=True)
     rows = np.diag(vectors) if vectors.ndim == 1 else vectors
     np.testing.assert_allclose(v, real[j] - real[i] + s @ rows, atol=1e-5)
     of_queries = jfrnn.search(u, cutoff, queries=q, capacity=CAPACITY, **given)
@@ -147,10 +143,8 @@ def smooth_in_numpy(r):
     return (0.7 - s) ** 3 * factor, of_length[:, None] * r + ((0.7 - s) ** 3)[:, None] * np.eye(3)[0]
 
 
-@pytest.mark.parametrize("per_system", [True, pytest.param(False, marks=SLOW)])
-@pytest.mark.parametrize(
-    "way", ["first", *(pytest.param(way, marks=SLOW) for way in ("search", "list", "edges", "vectors", "jax"))]
-)
+@pytest.mark.parametrize("per_system", [True, slow(False)])
+@pytest.mark.parametrize("way", ["first", *(slow(way) for way in ("search", "list", "edges", "vectors", "jax"))])
 def test_derivatives_in_coordinates_and_vectors_are_those_of_the_product(way, per_system):
     """Derivatives of sums over the oracle's pairs, after "first" also the second ones in one direction, by a complex step."""
     u, batch = np.asarray(points(np.float64, 4)), np.arange(N) % 3 if per_system else np.zeros(N, int)
@@ -194,28 +188,6 @@ def test_derivatives_in_coordinates_and_vectors_are_those_of_the_product(way, pe
         if way != "first":
             right = right_ahead.imag / step
             np.testing.assert_allclose(second, right, rtol=1e-8, atol=1e-9 * np.abs(right).max())
-
-
-@pytest.mark.slow
-def test_chunks_of_steps():
-    u = points(np.float64, 5)
-    box = lambda size: jfrnn.Box(size * 3 * jnp.asarray(SKEWED), fractional=True)  # noqa: E731
-
-    @jax.jit
-    def chunk(size, nbrs):
-        def step(_, carry):
-            size, nbrs = carry
-            return 0.9 * size, nbrs.update(u, box=box(0.9 * size))
-
-        return jax.lax.fori_loop(0, 5, step, (size, nbrs))
-
-    nbrs = jfrnn.search(u, 0.7, skin=0.1, box=jfrnn.Box(3 * SKEWED, fractional=True), capacity=32)
-    size, nbrs = jfrnn.run_chunk(chunk, jnp.asarray(1.0), nbrs, lambda size: u, box=box)
-    real, vectors = exact(u, float(size) * 3 * SKEWED, np.float64), np.asarray(nbrs.box.vectors)
-    assert nbrs.images is not None
-    assert masked_images(nbrs, u) == reference.reference_images(real, 0.7, matrix=vectors, periodic=[True] * 3)
-    graph = jax.jit(lambda nbrs, u: nbrs.to_jraph(u, 1024).nodes)(nbrs, u)
-    np.testing.assert_allclose(graph["positions"][:N], real, rtol=1e-12)
 
 
 def test_errors():

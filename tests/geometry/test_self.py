@@ -2,15 +2,16 @@
 
 from itertools import product
 
+import checked
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
+from checked import slow
 
 import jfrnn
 
-SLOW = pytest.mark.slow
 N, CAPACITY = 48, 64
 BOXES = {
     "open": None,
@@ -55,11 +56,6 @@ def each_pair(who, x, cutoff, more, kind, batch, closed):
     return found
 
 
-def pairs_and_shifts(idx, shifts, mask):
-    i, k = np.nonzero(np.asarray(mask))
-    return set(zip(i.tolist(), np.asarray(idx)[i, k].tolist(), map(tuple, np.asarray(shifts)[i, k].tolist()), strict=True))
-
-
 ALL = {"half", "edges", "sums", "sums of a list"}
 OFTEN = {
     ("either", "systems", "warp", np.float32): {"sums"},
@@ -75,7 +71,7 @@ def each_kind():
         if (who, kind, backend, dtype) in OFTEN:
             yield pytest.param(who, kind, backend, dtype, OFTEN[who, kind, backend, dtype], id=name)
         parts = ALL - {"half"} if who in ("gather", "scatter") else ALL
-        yield pytest.param(who, kind, backend, dtype, parts, id=f"{name}-all", marks=SLOW)
+        yield slow(who, kind, backend, dtype, parts, id=f"{name}-all")
 
 
 def one(r, i, j):
@@ -86,13 +82,8 @@ def one(r, i, j):
 def test_everyone_is_its_own_neighbor(who, kind, backend, dtype, parts):
     x, cutoff, more = scene(who, dtype)
     batch = np.arange(N, dtype=np.int32) % 2
-    given = {
-        "box": BOXES[kind],
-        "include_self": True,
-        "backend": backend,
-        **more,
-        **({"batch": batch} if kind == "systems" else {}),
-    }
+    given = {"box": BOXES[kind], "include_self": True, "backend": backend} | more
+    given |= {"batch": batch} if kind == "systems" else {}
     expected = each_pair(who, x, cutoff, more, kind, batch, False)
     counts, total = np.bincount([i for i, *_ in expected], minlength=N), len(expected)
 
@@ -116,8 +107,8 @@ def test_everyone_is_its_own_neighbor(who, kind, backend, dtype, parts):
 
     (nbrs, shifts, mask), found = find(x, cutoff)
     assert jfrnn.Status(int(nbrs.status)) == jfrnn.Status.NONFINITE
-    assert pairs_and_shifts(nbrs.idx, shifts, mask) == expected
-    assert pairs_and_shifts(nbrs.idx, shifts, np.asarray(nbrs.idx) < N) == expected
+    for held in (mask, np.asarray(nbrs.idx) < N):
+        assert checked.slots_as_set(nbrs.idx, held, shifts) == expected
     np.testing.assert_array_equal(nbrs.count, counts)
     there = np.isfinite(x).all(axis=1)
     for name in parts & {"sums", "sums of a list"}:
@@ -125,12 +116,12 @@ def test_everyone_is_its_own_neighbor(who, kind, backend, dtype, parts):
     if "edges" in parts:
         assert found["edges"] == total
     if "half" in parts:
-        half, *geometry = found["half"]
+        half, shifts, mask = found["half"]
         mirrored = {(i, j, s) for i, j, s in expected if i < j or (i == j and s >= (0, 0, 0))}
-        assert pairs_and_shifts(half.idx, *geometry) == mirrored
+        assert checked.slots_as_set(half.idx, mask, shifts) == mirrored
 
 
-@pytest.mark.parametrize(("who", "flat"), [("gather", False), *(pytest.param(*k, marks=SLOW) for k in product(WHO, (False, True)))])
+@pytest.mark.parametrize(("who", "flat"), [("gather", False), *(slow(*k) for k in product(WHO, (False, True)))])
 def test_a_list_with_a_skin_keeps_them(who, flat):
     x, cutoff, more = scene(who, np.float32)
     given = {"include_self": True, "skin": 0.05, **more}
@@ -142,14 +133,13 @@ def test_a_list_with_a_skin_keeps_them(who, flat):
         return nbrs, nbrs.edges(x) if flat else nbrs.vectors(x)[1]
 
     for moved in (x, x + np.float32(0.001) * np.random.default_rng(1).normal(size=x.shape).astype(np.float32)):
-        expected = each_pair(who, moved, cutoff, more, "open", None, False)
+        expected = {pair[:2] for pair in each_pair(who, moved, cutoff, more, "open", None, False)}
         after, found = updated(nbrs, moved)
         if flat:
-            mask = np.asarray(found.mask)
-            ends = zip(np.asarray(found.receivers)[mask].tolist(), np.asarray(found.senders)[mask].tolist(), strict=True)
-            assert {(i, j, (0, 0, 0)) for i, j in ends} == expected
+            ends = (np.asarray(part)[np.asarray(found.mask)] for part in (found.receivers, found.senders))
+            assert checked.as_set(*ends) == expected
         else:
-            assert pairs_and_shifts(after.idx, np.zeros((*after.idx.shape, 3), int), found) == expected
+            assert checked.slots_as_set(after.idx, found) == expected
 
 
 def test_separate_queries_have_no_self():

@@ -1,5 +1,6 @@
-"""`NeighborList.edges`: flat edges with their geometry, sorted by receiver."""
+"""`NeighborList.edges`: flat edges with their geometry, sorted by receiver; triplets of two edges that end at one particle."""
 
+import itertools
 from itertools import product
 
 import by_numpy
@@ -9,10 +10,10 @@ import numpy as np
 import pytest
 import reference
 import test_reverse as lists
+from checked import refuses, slow, sparing
 
 import jfrnn
 
-SLOW = pytest.mark.slow
 OFTEN = [("full", "open"), ("self", "images"), ("half", "images"), ("gather", "nearest"), ("queries", "open")]
 EACH = list(product(lists.KINDS, lists.BOXES))
 
@@ -28,7 +29,7 @@ def oracle(kind, box, x, q=None):
     return reference.reference_images(x, cutoff, queries=q, **cell, **given)
 
 
-@pytest.mark.parametrize(("kind", "box"), [pytest.param(*each, marks=[SLOW] * (each not in OFTEN)) for each in EACH])
+@pytest.mark.parametrize(("kind", "box"), sparing(EACH, OFTEN))
 def test_edges_are_the_pairs(kind, box):
     nbrs, x, q = lists.make(kind, "warp", box)
     (m, n), total = (nbrs.idx.shape[0], len(x)), int(np.asarray(nbrs.count).sum()) + 9
@@ -54,9 +55,7 @@ def test_edges_are_the_pairs(kind, box):
 
 
 DERIVED = [("full", "images", True), ("half", "images", True), ("queries", "open", True)]
-DERIVED += [
-    pytest.param(*each, marks=SLOW) for each in (("full", "images", False), ("half", "open", False), ("queries", "open", False))
-]
+DERIVED += [slow(*each) for each in (("full", "images", False), ("half", "open", False), ("queries", "open", False))]
 
 
 @pytest.mark.parametrize(("kind", "box", "reverse"), DERIVED)
@@ -100,33 +99,16 @@ def test_neither_edges_nor_sums_over_them_scatter_derivatives(kind):
 def test_too_many_pairs_are_never_silent():
     nbrs, x, _ = lists.make("full", "warp")
     held = len(oracle("full", "open", x))
-    with pytest.raises(ValueError, match=f"Pass total={held} or more"):
-        nbrs.edges(x, held - 1)
+    refuses(ValueError, f"Pass total={held} or more", nbrs.edges, x, held - 1)
     mask = np.asarray(nbrs.edges(x).mask)
     assert (mask.sum(), len(mask)) == (held, np.asarray(nbrs.count).sum())  # room for those of the skin, too
-    with pytest.raises(TypeError, match=r"write edges\(positions, total\)"):
-        jax.jit(lambda nbrs, x: nbrs.edges(x))(nbrs, x)
+    refuses(TypeError, r"write edges\(positions, total\)", jax.jit(lambda nbrs, x: nbrs.edges(x)), nbrs, x)
     for total in (held - 1, 0):
         edges = jax.jit(lambda nbrs, x, total=total: nbrs.edges(x, total))(nbrs, x)
         assert int(edges.status) == jfrnn.Status.TOTAL_OVERFLOW
         assert int(edges.pair_count) == held
         assert np.isnan(edges.displacement).all()
         assert np.isnan(edges.distance).all()
-
-
-def test_sums_by_receiver():
-    nbrs, x, _ = lists.make("full", "warp", "images")
-    total = int(np.asarray(nbrs.count).sum()) + 5
-
-    @jax.jit
-    def sums(nbrs, x):
-        edges = nbrs.edges(x, total)
-        messages = jnp.where(edges.mask, jnp.sum(edges.displacement**2, -1), 0)
-        return jax.ops.segment_sum(messages, edges.receivers, len(x), indices_are_sorted=True)
-
-    found, pairs, x = sums(nbrs, x), by_numpy.in_order(oracle("full", "images", x), 3), np.asarray(x)
-    r = by_numpy.vectors_of(pairs, x, x, np.diag(lists.BOXES["images"]))
-    np.testing.assert_allclose(found, by_numpy.add_up((r**2).sum(1), pairs.i, len(x)), rtol=1e-12)
 
 
 @pytest.mark.parametrize("box", ["open", "images"])
@@ -140,10 +122,8 @@ def test_a_graph_has_two_graphs(box):
     found = graph.senders, graph.receivers, *(graph.edges[name] for name in ("displacement", "shift", "distance"))
     right = edges.senders, edges.receivers, edges.displacement, edges.shift, edges.distance
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-15), found, right)
-    with pytest.raises(TypeError, match="total must be a static int"):
-        nbrs.to_jraph(x, 2.0)
-    with pytest.raises(ValueError, match="this list has queries"):
-        lists.make("queries", "warp")[0].to_jraph(x, 2000)
+    refuses(TypeError, "total must be a static int", nbrs.to_jraph, x, 2.0)
+    refuses(ValueError, "this list has queries", lists.make("queries", "warp")[0].to_jraph, x, 2000)
 
 
 def test_a_graph_is_one_of_jraph():
@@ -163,18 +143,76 @@ def test_a_graph_is_one_of_jraph():
     assert (len(whole.senders), whole.n_node.tolist()) == (len(pairs.i), [len(x)])
 
 
-def test_vmap():
-    nbrs, x, _ = lists.make("full", "warp", "nearest")
-    several = np.stack([x, x + 0.005 * np.sin(np.arange(x.size)).reshape(x.shape)])
-    found = jax.jit(jax.vmap(jax.grad(lambda x: jnp.sum(nbrs.edges(x, 1500).displacement ** 3))))(several)
-    for slopes, x in zip(found, several, strict=True):
-        pairs = by_numpy.in_order(oracle("full", "nearest", x), 3)
-        expected = by_numpy.pull(pairs, 3 * by_numpy.vectors_of(pairs, x, x, np.eye(3)) ** 2, x)
-        np.testing.assert_allclose(slopes, expected, atol=1e-12)
-
-
 def test_nobody():
     x = jnp.zeros((0, 3))
     edges = jfrnn.search(x, 1.0, capacity=4).edges(x, 3)
     assert edges.senders.tolist() == edges.receivers.tolist() == [0, 0, 0]
     assert not edges.mask.any()
+
+
+CUTOFF, BOX = 0.45, [1.0, 1.2, 1.1]
+X = np.random.default_rng(3).random((24, 3)) * BOX
+BOTH = {
+    "padded": lambda: jfrnn.search(X, CUTOFF, box=jfrnn.Box(BOX)).edges(X, 400),
+    "flat": lambda: jfrnn.search_edges(X, CUTOFF, box=jfrnn.Box(BOX), total=400).edges(X),
+}
+
+
+@pytest.mark.parametrize("half", [False, True])
+@pytest.mark.parametrize("kind", BOTH)
+def test_triplets_are_pairs_of_edges(kind, half):
+    edges = BOTH[kind]()
+    receivers, held = np.asarray(edges.receivers), int(edges.pair_count)
+    assert held < 400  # with padding
+    around = [np.flatnonzero(receivers[:held] == i).tolist() for i in range(len(X))]
+    expected = [pair for edge in around for pair in (itertools.combinations if half else itertools.permutations)(edge, 2)]
+    room = len(expected) + 7
+    found = jax.jit(lambda edges: edges.triplets(room, half=half))(edges)
+    assert list(zip(found.first[:-7].tolist(), found.second[:-7].tolist())) == expected
+    assert (found.first[-7:].tolist(), found.second[-7:].tolist()) == ([400] * 7, [400] * 7)
+    assert (np.flatnonzero(found.mask) == np.arange(len(expected))).all()
+    assert int(found.triplet_count) == len(expected) > 100
+    assert len(edges.triplets(half=half).first) == len(expected)
+    few = jax.jit(lambda edges: edges.triplets(5, half=half))(edges)
+    assert (few.first.tolist(), int(few.triplet_count)) == ([a for a, _ in expected[:5]], len(expected))
+    refuses(ValueError, r"total=5 is too small", edges.triplets, 5, half=half)
+
+
+def test_an_energy_of_angles():
+    """Its forces are those of all particles with all, as of Stillinger and Weber (1985, doi:10.1103/PhysRevB.31.5262)."""
+
+    def term(r, s):  # of displacements to two neighbors
+        a, b = jnp.sqrt(r @ r), jnp.sqrt(s @ s)
+        smooth = jnp.where((a < CUTOFF) & (b < CUTOFF), ((a - CUTOFF) * (b - CUTOFF)) ** 2, 0.0)
+        return smooth * (r @ s / (a * b) + 1 / 3) ** 2
+
+    box = jnp.asarray(BOX)
+    nbrs = jfrnn.search_edges(X, CUTOFF, box=jfrnn.Box(BOX), total=400)
+
+    def energy(x):
+        edges = nbrs.edges(x)
+        found = edges.triplets(3000, half=True)
+        r, s = (edges.displacement.at[jnp.where(found.mask, part, 0)].get() for part in (found.first, found.second))
+        return jnp.where(found.mask, jax.vmap(term)(r, s), 0.0).sum()
+
+    def expected(x):
+        away = x[None] - x[:, None]
+        away = away - box * jnp.round(away / box)
+        i, j, k = (part.ravel() for part in np.indices((24, 24, 24)))
+        used = (i != j) & (i != k) & (j < k)
+        return jax.vmap(term)(away[i[used], j[used]], away[i[used], k[used]]).sum()
+
+    found, true = (jax.jit(jax.value_and_grad(f))(jnp.asarray(X)) for f in (energy, expected))
+    assert float(true[0]) > 0
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-10, atol=1e-14), found, true)
+
+
+def test_nothing_and_bad_input():
+    edges = jfrnn.search_edges(X, 1e-3, total=0).edges(X)
+    assert edges.triplets().first.shape == (0,)
+    assert edges.triplets(3).mask.tolist() == [False] * 3
+    lacking = jax.jit(lambda: jfrnn.search_edges(X, CUTOFF, total=20).edges(X).triplets(9).triplet_count)()
+    assert int(lacking) < 0  # as sums are NaN
+    with pytest.raises(TypeError, match=r"total must be given inside jax\.jit"):
+        jax.jit(lambda edges: edges.triplets().first)(edges)
+    refuses(TypeError, "half must be True or False", edges.triplets, 3, half=1)

@@ -8,6 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import reference
+from checked import slow, sparing
 from test_kept import by_arrays
 
 import jfrnn
@@ -24,7 +26,6 @@ KINDS = {
 }
 CAPACITY = 64  # given: a program that counts would be compiled besides
 N, ASKING, CUTOFF = 40, 17, 0.4
-SLOW = pytest.mark.slow
 
 
 def options_of(kind, box="open", dtype=np.float64):
@@ -55,38 +56,32 @@ def traced(kind, box="open", reverse=True):
     return jax.eval_shape(lambda x: jfrnn.search(x, cutoff, **options), x), x, options["queries"]
 
 
-def slots_of(nbrs):
-    """Return the slots of each source, as sets, from what the list keeps."""
-    n, total = nbrs.source_count, nbrs.idx.size
-    kept = jax.tree.map(np.asarray, nbrs.reverse)
+def assert_all_slots(nbrs):
+    """Fail unless the list keeps all slots of each source."""
+    n, flat, kept = nbrs.source_count, np.asarray(nbrs.idx).reshape(-1), jax.tree.map(np.asarray, nbrs.reverse)
     if kept.starts is None:
-        return [set(row[row < total].tolist()) for row in kept.slots]
-    return [set(kept.slots[a : a + k].tolist()) for a, k in zip(kept.starts[:n], kept.lengths[:n], strict=True)]
+        found = [row[row < len(flat)] for row in kept.slots]
+    else:
+        found = [kept.slots[a : a + k] for a, k in zip(kept.starts[:n], kept.lengths[:n], strict=True)]
+    assert [set(slots.tolist()) for slots in found] == [set(np.flatnonzero(flat == j).tolist()) for j in range(n)]
 
 
 # In all kinds of boxes the lists of the most usual kind, the others in some; by hand all.
-SOME = [*(("full", box) for box in BOXES), ("self", "images"), ("half", "nearest"), ("half", "images")]
-SOME += [("gather", "nearest"), ("queries", "open")]
+SOME = [*product(["full"], BOXES, ["warp"]), ("self", "images", "warp"), ("half", "nearest", "warp"), ("half", "images", "warp")]
+SOME += [("gather", "nearest", "warp"), ("queries", "open", "warp")]
+BY_ARRAYS = [("half", "open", "brute"), slow("queries", "images", "brute")]
 
 
-def each_list(kinds):
-    """Yield these kinds of lists in each box, by default those of `SOME`."""
-    for kind, box in product(kinds, BOXES):
-        yield pytest.param(kind, box, "warp", marks=[SLOW] * ((kind, box) not in SOME))
-
-
-BY_ARRAYS = [("half", "open", "brute"), pytest.param("queries", "images", "brute", marks=SLOW)]
-
-
-@pytest.mark.parametrize(("kind", "box", "backend"), [*each_list(KINDS), *BY_ARRAYS])
+@pytest.mark.parametrize(("kind", "box", "backend"), [*sparing(product(KINDS, BOXES, ["warp"]), SOME), *BY_ARRAYS])
 def test_each_source_has_all_its_slots(kind, box, backend):
     nbrs, *_ = make(kind, backend, box)
-    flat = np.asarray(nbrs.idx).reshape(-1)
-    assert (flat < nbrs.source_count).sum() > 100
-    assert slots_of(nbrs) == [set(np.flatnonzero(flat == j).tolist()) for j in range(nbrs.source_count)]
+    assert (np.asarray(nbrs.idx) < nbrs.source_count).sum() > 100
+    assert_all_slots(nbrs)
 
 
-@pytest.mark.parametrize(("kind", "box", "backend"), [*each_list(("full", "self", "either")), ("self", "images", "brute")])
+@pytest.mark.parametrize(
+    ("kind", "box", "backend"), [*sparing(product(("full", "self", "either"), BOXES, ["warp"]), SOME), ("self", "images", "brute")]
+)
 def test_each_image_has_its_own_reverse(kind, box, backend):
     nbrs, x, _ = make(kind, backend, box)
     rows, slots = np.asarray(nbrs.idx), np.asarray(nbrs.reverse.slots).reshape(-1)
@@ -118,8 +113,8 @@ def cubes_of(pairs, x, sides=1.0):
 
 
 DERIVED = [("full", "images", False), ("half", "nearest", True), ("queries", "open", False)]
-DERIVED += [pytest.param(*each, marks=SLOW) for each in (("full", "open", True), ("half", "images", False))]
-DERIVED += [pytest.param(*each, marks=SLOW) for each in (("queries", "images", True), ("gather", "open", False))]
+DERIVED += [slow(*each) for each in (("full", "open", True), ("half", "images", False))]
+DERIVED += [slow(*each) for each in (("queries", "images", True), ("gather", "open", False))]
 
 
 @pytest.mark.parametrize(("kind", "box", "reverse"), DERIVED)
@@ -205,7 +200,7 @@ def test_derivatives_of_distances(kind):
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-11, atol=1e-11), derivatives, expected)
 
 
-@pytest.mark.parametrize(("kind", "reverse"), [("full", False), ("half", True), pytest.param("queries", False, marks=SLOW)])
+@pytest.mark.parametrize(("kind", "reverse"), [("full", False), ("half", True), slow("queries", False)])
 def test_derivatives_do_not_scatter(kind, reverse):
     def both(nbrs, x, q):
         f = jax.grad(lambda x: jnp.sum(by_arrays(nbrs).distances(x, queries=q)[0] ** 3))
@@ -220,7 +215,7 @@ def test_derivatives_do_not_scatter(kind, reverse):
 def test_vmap(kind):
     """Over positions, with one list; over lists too, which then become one."""
     nbrs, x, _ = make(kind, "warp", "nearest")
-    several = np.stack([x, x + 0.01 * np.sin(np.arange(x.size)).reshape(x.shape), x[::-1]])
+    several = np.stack([x + step * np.sin(np.arange(x.size)).reshape(x.shape) for step in (0, 0.01, -0.01)])  # the skin allows it
     cutoff, options = options_of(kind, "nearest")
     options |= {"capacity": CAPACITY, "reverse": True, "backend": "warp", "skin": 0.05}
     lists = [jfrnn.search(each, cutoff, **options) for each in several]
@@ -235,22 +230,11 @@ def test_vmap(kind):
 
     of_one, of_each, bent = all_of(nbrs, jax.tree.map(lambda *leaves: np.stack(leaves), *lists), several)
     for k, x in enumerate(several):
-        np.testing.assert_allclose(of_one[k], cubes_of(near_pairs(nbrs, x), x)[1], atol=1e-12)
-        pairs = near_pairs(lists[k], x)
-        np.testing.assert_allclose(of_each[k], cubes_of(pairs, x)[1], atol=1e-12)
-        expected = by_numpy.along(lambda x, pairs=pairs: cubes_of(pairs, x)[1], x, x)
-        np.testing.assert_allclose(bent[k], expected, atol=1e-11)
-
-
-def near_pairs(nbrs, x):
-    """Return the pairs of a list in a box of length 1 that are closer than the cutoff, which no distance is as near as rounding."""
-    i, k = np.nonzero(np.asarray(nbrs.idx) < len(x))
-    j = np.asarray(nbrs.idx)[i, k]
-    shifts = -np.rint(x[j] - x[i]).astype(int)
-    apart = np.linalg.norm(x[j] - x[i] + shifts, axis=1)
-    assert np.abs(apart - CUTOFF).min() > 1e-9
-    near = apart < CUTOFF
-    return by_numpy.Pairs(i[near], j[near], shifts[near])
+        images = reference.reference_images(x, CUTOFF, matrix=np.ones(3), periodic=(True,) * 3, half=kind == "half")
+        expected = functools.partial(lambda pairs, x: cubes_of(pairs, x)[1], by_numpy.in_order(images, 3))
+        for found in (of_one[k], of_each[k]):
+            np.testing.assert_allclose(found, expected(x), atol=1e-12)
+        np.testing.assert_allclose(bent[k], by_numpy.along(expected, x, x), atol=1e-11)
 
 
 @pytest.mark.parametrize("kind", ["full", "half"])
@@ -259,19 +243,8 @@ def test_updates_keep_it(kind):
     moved = x + 0.2 * np.sin(9 * x)
     updated = jax.jit(lambda nbrs, x: nbrs.update(x))(nbrs, moved)
     assert updated.rebuild_count == nbrs.rebuild_count + 1
-    flat = np.asarray(updated.idx).reshape(-1)
-    assert slots_of(updated) == [set(np.flatnonzero(flat == j).tolist()) for j in range(N)]
-    grown = updated.grow(moved, slack=2.0)
-    flat = np.asarray(grown.idx).reshape(-1)
-    assert slots_of(grown) == [set(np.flatnonzero(flat == j).tolist()) for j in range(N)]
-
-
-@pytest.mark.parametrize("queries", [None, ASKING])
-def test_what_it_takes_is_planned(queries):
-    nbrs, *_ = make("full" if queries is None else "queries", "warp")
-    options = {"dtype": np.float64, "queries": queries, "skin": 0.05, "reverse": True, "backend": "warp"}
-    plan = jfrnn.memory_plan(N, CUTOFF, nbrs.capacity, **options)
-    assert plan.list_bytes == sum(leaf.nbytes for leaf in jax.tree.leaves(nbrs))
+    for each in (updated, updated.grow(moved, slack=2.0)):
+        assert_all_slots(each)
 
 
 @pytest.mark.parametrize("kind", ["full", "half", "queries"])
@@ -296,10 +269,7 @@ PAIRWISE = [("open", 2, 1.0, True, np.float64), ("images", 3, 1.0, False, np.flo
 
 @pytest.mark.parametrize(
     ("box", "dim", "scale", "skinned", "dtype"),
-    [
-        pytest.param(*each, skinned, dtype, marks=[SLOW] * ((*each, skinned, dtype) not in PAIRWISE))
-        for each, skinned, dtype in product(MEASURED, (False, True), (np.float32, np.float64))
-    ],
+    sparing(((*each, *kind) for each, kind in product(MEASURED, product((False, True), (np.float32, np.float64)))), PAIRWISE),
 )
 def test_distances_are_the_lengths_of_vectors(box, dim, scale, skinned, dtype):
     """Of points of which two coincide and two nearly do, in rows whose length is no multiple of four; derivatives, too."""

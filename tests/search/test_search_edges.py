@@ -1,13 +1,18 @@
 """`search_edges`: flat lists of edges against the oracle, what too small a total says, and their geometry against padded lists."""
 
+from itertools import product
+
+import checked
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
+from by_numpy import add_up, in_order, pull
+from checked import slow, slowly, sparing
 
 import jfrnn
-from jfrnn._engine.rows import add_up
+from jfrnn._engine.rows import add_up as add_up_rows
 
 LENGTHS = {"open": None, "nearest": [1.0, 1.0, 1.0], "images": [0.5, 0.3, 1.0]}
 N, CUTOFF = 60, 0.3
@@ -33,11 +38,8 @@ def oracle(x, box, **options):
 
 def edges_as_set(edges):
     """Return (i, j, S) of the edges, after checking that each is there once, and sorted by receiver."""
-    real = np.asarray(edges.mask)
-    columns = (np.asarray(x)[real].tolist() for x in (edges.receivers, edges.senders, edges.shift))
-    triples = [(i, j, tuple(shift)) for i, j, shift in zip(*columns, strict=True)]
-    found = set(triples)
-    assert len(found) == len(triples) == int(edges.pair_count)
+    found = checked.as_set(*(np.asarray(x)[np.asarray(edges.mask)] for x in (edges.receivers, edges.senders, edges.shift)))
+    assert len(found) == int(edges.pair_count)
     assert (np.diff(edges.receivers) >= 0).all()
     return found
 
@@ -50,20 +52,11 @@ def assert_right(nbrs, x, expected, queries=None):
     assert (np.asarray(nbrs.senders)[held:] == len(x)).all()
     assert (np.asarray(nbrs.receivers)[held:] == m).all()
     np.testing.assert_array_equal(np.diff(nbrs.offsets), np.bincount(np.asarray(nbrs.receivers)[:held], minlength=m))
-    i, j = nbrs.pairs()
-    assert set(zip(i.tolist(), j.tolist(), strict=True)) == {pair[:2] for pair in expected}
+    assert set(zip(*(part.tolist() for part in nbrs.pairs()), strict=True)) == {pair[:2] for pair in expected}
     nbrs.check()
 
 
-@pytest.mark.parametrize(
-    ("backend", "box"),
-    [
-        ("warp", "images"),
-        *(pytest.param("brute", box, marks=SLOW) for box in ("open", "images")),
-        *(pytest.param("warp", box, marks=SLOW) for box in ("open", "nearest")),
-        *(pytest.param("jax", box, marks=SLOW) for box in LENGTHS),
-    ],
-)
+@pytest.mark.parametrize(("backend", "box"), sparing(product(("warp", "jax", "brute"), LENGTHS), [("warp", "images")]))
 def test_edges_are_those_of_the_oracle(backend, box):
     x = points(box=box)
     assert_right(jfrnn.search_edges(x, CUTOFF, box=box_of(box), backend=backend), x, oracle(x, box))
@@ -97,17 +90,9 @@ def test_systems(backend):
     x, systems = points(120, "images"), np.arange(120) % 3
     nbrs = jfrnn.search_edges(x, CUTOFF, batch=systems, box=box_of("images"), backend=backend)
     assert_right(nbrs, x, {p for p in oracle(x, "images") if systems[p[0]] == systems[p[1]]})
-    cells = np.array([[0.5, 0.3, 1.0], [1.0, 1.0, 1.0], [0.4, 0.6, 0.8]], np.float32)
-    nbrs = jfrnn.search_edges(x, CUTOFF, batch=systems, box=jfrnn.Box(cells, per_system=True), backend=backend)
-    expected = set()
-    for system, cell in enumerate(cells):
-        members = np.flatnonzero(systems == system)
-        found = reference.reference_images(x[members], CUTOFF, matrix=cell, periodic=(True,) * 3)
-        expected |= {(members[i], members[j], shift) for i, j, shift in found}
-    assert_right(nbrs, x, expected)
 
 
-@pytest.mark.parametrize("backend", ["warp", pytest.param("brute", marks=SLOW)])
+@pytest.mark.parametrize("backend", ["warp", slow("brute")])
 def test_too_small_a_total_is_never_silent(backend):
     x = points()
     whole = jfrnn.search_edges(x, CUTOFF, backend=backend)
@@ -150,35 +135,7 @@ def test_a_chunk_is_replayed_with_a_larger_total():
     assert edges_as_set(grown.edges(y)) == oracle(np.asarray(y), "open")
 
 
-@SLOW
-@pytest.mark.parametrize(("half", "box"), [(False, "open"), *((half, "images") for half in (False, True))])
-@pytest.mark.parametrize("reverse", [True, False])
-def test_geometry_and_derivatives_are_those_of_padded_lists(half, box, reverse):
-    x = jnp.asarray(points(30, box, dtype=np.float64))
-    options = {"box": box_of(box, np.float64), "half": half, "skin": 0.02, "reverse": reverse, "backend": "warp"}
-    flat, padded = (find(x, CUTOFF, **options) for find in (jfrnn.search_edges, jfrnn.search))
-    moved = x + 0.005 * jnp.sin(40 * x)
-    flat, padded = flat.update(moved), padded.update(moved)
-    assert int(flat.rebuild_count) == 0
-
-    def energy(edges_of):
-        def f(x, a):
-            edges = edges_of(x, None if flat.box is None else jfrnn.Box(a))
-            return jnp.sum(jnp.where(edges.mask, jnp.sin(3 * edges.distance) * edges.displacement[:, 0], 0))
-
-        def all_of(x, a):
-            slope = jax.grad(f)
-            return f(x, a), jax.grad(f, (0, 1))(x, a), jax.jvp(lambda x: slope(x, a), (x,), (x,))[1]
-
-        return jax.jit(all_of)(moved, jnp.asarray(LENGTHS[box] or [1.0] * 3))
-
-    total = flat.total
-    of_flat, of_padded = energy(lambda x, b: flat.edges(x, box=b)), energy(lambda x, b: padded.edges(x, total, box=b))
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-10), of_flat, of_padded)
-    assert edges_as_set(flat.edges(moved)) == edges_as_set(padded.edges(moved, total))
-
-
-@pytest.mark.parametrize("half", [True, pytest.param(False, marks=SLOW)])
+@pytest.mark.parametrize("half", [True, slow(False)])
 def test_sums_are_those_of_numpy(half):
     """Over the pairs of a flat list at positions of now and at a shorter cutoff, with derivatives in positions, values and box."""
     x, lengths = points(30, "images", dtype=np.float64), np.array(LENGTHS["images"])
@@ -195,22 +152,14 @@ def test_sums_are_those_of_numpy(half):
 
         return jax.value_and_grad(f, (0, 1, 2))(x, m, lengths)
 
-    pairs = reference.reference_images(x, cutoff, matrix=lengths, periodic=(True,) * 3)
-    found = np.array([(i, j, *shift) for i, j, shift in pairs])
-    i, j, shift = found[:, 0], found[:, 1], found[:, 2:]
+    i, j, shift = pairs = in_order(reference.reference_images(x, cutoff, matrix=lengths, periodic=(True,) * 3), 3)
     assert (i == j).any()
     r = x[j] - x[i] + shift * lengths
-    each, pull = w[i] * m[i] * m[j] ** 2, 3 * (w[i] * m[i] * m[j] ** 2)[:, None] * r**2
-    cubes, slopes = (r**3).sum(1), [np.zeros((30, 3)), np.zeros(30), (pull * shift).sum(0)]
-    for k, sign in ((j, 1), (i, -1)):
-        np.add.at(slopes[0], k, sign * pull)
-    np.add.at(slopes[1], i, each / m[i] * cubes)
-    np.add.at(slopes[1], j, 2 * each / m[j] * cubes)
-    jax.tree.map(
-        lambda a, b: np.testing.assert_allclose(a, b, atol=1e-12 * np.abs(b).max()),
-        all_of(x, m, lengths, nbrs),
-        (each @ cubes, tuple(slopes)),
-    )
+    each, cubes = w[i] * m[i] * m[j] ** 2, (r**3).sum(1)
+    of_r, of_m = 3 * each[:, None] * r**2, add_up(each / m[i] * cubes, i, 30) + add_up(2 * each / m[j] * cubes, j, 30)
+    expected = each @ cubes, (pull(pairs, of_r, x), of_m, (of_r * shift).sum(0))
+    found = all_of(x, m, lengths, nbrs)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-12 * np.abs(b).max()), found, expected)
     if half:
         with pytest.raises(ValueError, match="must be a full list for reduce='max'"):
             jfrnn.pair_sum(lambda r, i, j: r, x, None, neighbors=nbrs, reduce="max")
@@ -233,20 +182,6 @@ def test_graphs():
         jfrnn.search_edges(x, CUTOFF, skin=0.1, backend="warp").to_jraph(x)
     with pytest.raises(ValueError, match="this list has queries"):
         jfrnn.search_edges(x, CUTOFF, queries=x[:3], backend="warp").to_jraph(x)
-
-
-def test_vmap():
-    x = np.stack([points(seed=seed) for seed in (0, 1)])
-
-    def count_near(x):
-        nbrs = jfrnn.search_edges(x, CUTOFF, total=2000, backend="warp")
-        return nbrs.pair_count, jnp.sum(nbrs.edges(x).distance)
-
-    counts, sums = jax.jit(jax.vmap(count_near))(x)
-    for k in range(2):
-        i, j = np.array([pair[:2] for pair in oracle(x[k], "open")]).T
-        np.testing.assert_allclose(np.linalg.norm(x[k][j] - x[k][i], axis=1).sum(), sums[k], rtol=1e-5)
-        assert int(counts[k]) == len(i)
 
 
 @pytest.mark.parametrize(
@@ -303,13 +238,11 @@ def test_where_rows_begin_never_wraps():
     exact = np.concatenate([[0], np.cumsum(counts, dtype=np.int64)])
     wrapped = np.cumsum(counts, dtype=np.int32)
     assert (wrapped[exact[1:] >= 2**31] >= 0).any()
-    np.testing.assert_array_equal(jax.jit(add_up)(jnp.asarray(counts)), np.minimum(exact, 2**31 - 1))
-    np.testing.assert_array_equal(jax.jit(add_up)(jnp.asarray(counts[:3])), exact[:4])
+    np.testing.assert_array_equal(jax.jit(add_up_rows)(jnp.asarray(counts)), np.minimum(exact, 2**31 - 1))
+    np.testing.assert_array_equal(jax.jit(add_up_rows)(jnp.asarray(counts[:3])), exact[:4])
 
 
-@pytest.mark.parametrize(
-    ("backend", "include_self"), [("warp", False), *(pytest.param(*each, marks=SLOW) for each in (("warp", True), ("jax", False)))]
-)
+@pytest.mark.parametrize(("backend", "include_self"), [("warp", False), *slowly(("warp", True), ("jax", False))])
 def test_own_images_in_half_lists(backend, include_self):
     """They are listed once, and so counted, with and without a program, where both ends of a pair are one particle."""
     x, lengths = points(5), np.array([0.25, 0.25, 0.25])

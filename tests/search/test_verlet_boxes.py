@@ -8,6 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
+from checked import refuses, slow
+from test_box import masked_images, shifts_and_mask
 
 import jfrnn
 
@@ -19,29 +21,8 @@ def oracle(x, cutoff, box, **options):
     return reference.reference_images(np.asarray(x), cutoff, matrix=rows, periodic=box.periodic, **options)
 
 
-@jax.jit
-def geometry(nbrs, x, queries=None):
-    return nbrs.shifts(x, queries=queries), nbrs.vectors(x, queries=queries)[1]
-
-
-def masked_images(nbrs, x, found=None, **options):
-    """Return (i, j, S) of every pair within the true cutoff, as the list's own geometry has them."""
-    assert not nbrs.overflow
-    shifts, mask = map(np.asarray, geometry(nbrs, x, **options) if found is None else found)
-    i, k = np.nonzero(mask)
-    named = by_numpy.Pairs(i, np.asarray(nbrs.idx)[i, k], shifts[i, k])
-    pairs = by_numpy.named(named)
-    assert len(pairs) == len(i)
-    return pairs
-
-
-def rows_of(box):
-    rows = np.asarray(box.vectors, np.float64)
-    return np.diag(rows) if rows.ndim == 1 else rows
-
-
-@pytest.mark.parametrize("dtype", [np.float32, pytest.param(np.float64, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("backend", ["warp", pytest.param("jax", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("dtype", [np.float32, slow(np.float64)])
+@pytest.mark.parametrize("backend", ["warp", slow("jax")])
 def test_positions_that_are_wrapped_in_every_step_cost_no_lists(backend, dtype):
     lengths, cutoff, skin = np.array([1.0, 1.3, 0.9]), 0.2, 0.05
     box, rng = jfrnn.Box(lengths), np.random.default_rng(0)
@@ -82,12 +63,11 @@ UPDATED = ("long, own images",)  # in lists of other kinds, tests below ask whet
 ALL = [(dtype, kind, asked) for dtype in (np.float32, np.float64) for kind in KINDS for asked in ("own", "half", "queries")]
 
 
-@pytest.mark.parametrize(
-    ("dtype", "kind", "asked"), [*EACH, *(pytest.param(*x, marks=pytest.mark.slow) for x in ALL if x not in EACH)]
-)
+@pytest.mark.parametrize(("dtype", "kind", "asked"), [*EACH, *(slow(*x) for x in ALL if x not in EACH)])
 def test_images_of_a_kept_list_are_those_of_the_moved_particles(dtype, kind, asked):
     box, cutoff = KINDS[kind]
-    rng, skin, rows = np.random.default_rng(1), 0.1, rows_of(box)
+    rng, skin, rows = np.random.default_rng(1), 0.1, np.asarray(box.vectors, np.float64)
+    rows = np.diag(rows) if rows.ndim == 1 else rows
     whole = lambda size, most: (rng.integers(-most, most + 1, (size, 3)) * box.periodic) @ rows  # noqa: E731
     before = (rng.uniform(0, 1, (24, 3)) @ rows + whole(24, 2)).astype(dtype)
     points = None if asked != "queries" else (rng.uniform(0, 1, (9, 3)) @ rows + whole(9, 2)).astype(dtype)
@@ -108,7 +88,7 @@ def test_images_of_a_kept_list_are_those_of_the_moved_particles(dtype, kind, ask
     def all_of(nbrs, x, **given):
         kept = nbrs.update(x, **given) if kind in UPDATED or (dtype, kind, asked) not in EACH else nbrs
         sums = None if (kind, asked) != ("skewed", "own") else jfrnn.pair_sum(weight, x, None, neighbors=kept)
-        return kept, geometry(kept, x, **given), sums
+        return kept, shifts_and_mask(kept, x, given), sums
 
     kept, found, sums = all_of(nbrs, after, **given)
     kept.check()
@@ -175,8 +155,7 @@ def test_particles_that_leave_the_range_of_a_box_are_noticed():
     gone = nbrs.update(beyond(600))  # so far away, coordinates are rounded by more than the skin
     gone.check()
     assert masked_images(gone, beyond(600)) == oracle(beyond(600), 0.3, box)
-    with pytest.raises(ValueError, match=r"too far away.*positions\[0\] lies"):
-        nbrs.update(beyond(1e7)).check()
+    refuses(ValueError, r"too far away.*positions\[0\] lies", nbrs.update(beyond(1e7)).check)
     far = jfrnn.search(beyond(-500), 0.3, skin=0.1, box=box, capacity=16)
     assert masked_images(far, beyond(-500)) == oracle(beyond(-500), 0.3, box)
 
@@ -217,17 +196,16 @@ def by_the_loop_of_the_readme(chunk, state, nbrs):
 
 def by_grow(chunk, state, nbrs):
     state, nbrs = chunk(state, nbrs)
-    with pytest.raises(ValueError, match=r"too small for the images.*grow\(\) of a list.*needs images=\(1, 1, 1\)"):
-        nbrs.check()
+    refuses(ValueError, r"too small for the images.*grow\(\) of a list.*needs images=\(1, 1, 1\)", nbrs.check)
     return state, nbrs.grow(state[0] * state[1])
 
 
 @pytest.mark.parametrize(
     ("lengths", "cutoff", "skin", "ratio", "run"),
     [
-        pytest.param([25.75, 25.75, 25.75], 12.0, 0.5, 0.96, by_run_chunk, marks=pytest.mark.slow),
+        slow([25.75, 25.75, 25.75], 12.0, 0.5, 0.96, by_run_chunk),
         ([25.75, 25.75, 25.75], 12.0, 0.5, 0.96, by_grow),
-        pytest.param([10.0, 9.0, 11.0], 2.5, 0.0, 0.1, by_the_loop_of_the_readme, marks=pytest.mark.slow),
+        slow([10.0, 9.0, 11.0], 2.5, 0.0, 0.1, by_the_loop_of_the_readme),
     ],
     ids=["run_chunk", "grow", "loop"],
 )
@@ -260,10 +238,8 @@ def test_what_no_room_mends_is_raised():
     x = jnp.asarray(np.random.default_rng(6).uniform(0, 1, (6, 3)))
     nbrs = jfrnn.search(x, 0.3, box=jfrnn.Box([1.0, 1.0, 1.0]), capacity=64)
     lost = jax.jit(lambda x, n: (x, n.update(x.at[0].set(jnp.nan))))
-    with pytest.raises(ValueError, match="hold non-finite coordinates"):
-        jfrnn.run_chunk(lost, x, nbrs, lambda x: x)
-    with pytest.raises(ValueError, match="hold non-finite coordinates"):
-        nbrs.grow(x.at[0].set(jnp.nan))
+    refuses(ValueError, "hold non-finite coordinates", jfrnn.run_chunk, lost, x, nbrs, lambda x: x)
+    refuses(ValueError, "hold non-finite coordinates", nbrs.grow, x.at[0].set(jnp.nan))
     flat = jax.jit(lambda x, n: (x, n.update(x, box=jfrnn.Box(0 * x[0]))))
     with pytest.raises(ValueError, match=r"lengths of periodic axes must be positive, got \[0.0, 0.0, 0.0\]"):
         jfrnn.run_chunk(flat, x, nbrs, lambda x: x)

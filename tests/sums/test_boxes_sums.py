@@ -1,10 +1,12 @@
 """Fused pair sums with a box per system, searched and over kept lists: the pairs of the oracle, and derivatives."""
 
 import functools
+from itertools import product
 
 import jax
 import numpy as np
 import pytest
+from checked import sparing
 from marked import assert_marks, marks
 from test_boxes import CAPACITY, box_of, expected_images
 from test_kept_cuda import compiles, term_of
@@ -46,14 +48,7 @@ def assert_case(name, dtype, dim, listed):
     assert_marks(found, pairs, given.positions, points, cells[np.clip(systems, 0, len(cells) - 1)])
 
 
-@pytest.mark.parametrize(
-    ("name", "listed"),
-    [
-        (name, listed) if (name, listed) in (("mixed", False), ("far", True)) else pytest.param(name, listed, marks=SLOW)
-        for name in CRYSTAL_CASES
-        for listed in (False, True)
-    ],
-)
+@pytest.mark.parametrize(("name", "listed"), sparing(product(CRYSTAL_CASES, (False, True)), [("mixed", False), ("far", True)]))
 def test_case(name, listed):
     assert_case(name, np.float32, 3, listed)
 

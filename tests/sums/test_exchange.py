@@ -76,20 +76,3 @@ def test_forces_of_weighted_sums(name, scene):
     found, expected = force(lambda x: jfrnn.pair_sum(fn, x, CUTOFF, backend="brute")), force(plain)
     np.testing.assert_allclose(found, expected, rtol=1e-10, atol=1e-12)
     assert np.abs(expected).max() > 0.1
-
-
-@pytest.mark.parametrize("name", ["several", "differences"])
-@pytest.mark.slow
-def test_derivatives_are_the_same(name, scene, monkeypatch):
-    x, data, moved = scene
-    fn, box = FUNCTIONS[name][0], jfrnn.Box(np.full(3, SIDE))
-    first = jax.grad(lambda x, data: weighted(fn, x, data, box=box, backend="brute"), (0, 1))
-
-    def everything(x, data):
-        return first(x, data), jax.jvp(lambda x: first(x, data), (x,), (moved,))[1]
-
-    with jax.enable_x64(True):
-        found = everything(x, data)
-        monkeypatch.setattr(summation, "signs_of", lambda term: (None,) * len(term.summands))
-        plain = everything(x, data)
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9), found, plain)

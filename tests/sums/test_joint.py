@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from checked import slow
 from jax.interpreters import mlir
 
 import jfrnn
@@ -95,7 +96,7 @@ def several(x, m, backend="warp", **options):
     return one, two, density(x, m, backend, **options)
 
 
-SLOW = [pytest.param(function, "compensated", marks=pytest.mark.slow) for function in (pressure, several)]
+SLOW = [slow(function, "compensated") for function in (pressure, several)]
 
 
 @pytest.mark.parametrize(

@@ -10,24 +10,9 @@ import numpy as np
 import pytest
 import reference
 from by_numpy import add_up, in_order
-from marked import assert_compensated, assert_marks, cancelling, marks
-from test_pair_sum import (
-    CUTOFF,
-    HARD,
-    LENGTH,
-    SLOW,
-    N,
-    assert_same,
-    everything,
-    oracle,
-    oracle_sum,
-    partly_active,
-    scene,
-    smooth,
-    smooth_slopes,
-    stepped,
-    tangents_of,
-)
+from checked import slow
+from marked import assert_compensated, cancelling
+from test_pair_sum import CUTOFF, LENGTH, N, assert_same, everything, oracle, oracle_sum, scene, stepped, tangents_of
 
 import jfrnn
 from jfrnn._sums import translate as _translate
@@ -55,7 +40,7 @@ def one(r, i, j):
     return 1.0
 
 
-@pytest.mark.parametrize("box", [pytest.param(None, marks=SLOW), jfrnn.Box([1.0] * 3)], ids=["open", "box"])
+@pytest.mark.parametrize("box", [slow(None), jfrnn.Box([1.0] * 3)], ids=["open", "box"])
 def test_integers_travel_whose_bits_are_no_usual_floats(box):
     """-0, numbers that are none and denormals, as floats: nothing may be computed with them on the way."""
     bits = np.array([0x80000000, 0x7F800001, 0xFF812345, 0x00000001, 0x7FC00000, 0x80000001], np.uint32).view(np.int32)
@@ -71,46 +56,6 @@ def test_integers_travel_whose_bits_are_no_usual_floats(box):
     expected = [np.bincount(i[kinds[j] == k], minlength=300) for k in bits]
     assert all(total.sum() > 1000 for total in expected)
     np.testing.assert_array_equal(np.stack(found), np.stack(expected))
-
-
-def marked(x, cutoff, queries=None, **options):
-    ids = np.arange(LENGTH, dtype=x.dtype)
-    if queries is not None:
-        options |= {"queries": checked.padded(queries, LENGTH), "query_values": ids}
-    return fused(marks, jnp.asarray(checked.padded(x, LENGTH)), cutoff, ids, **options)
-
-
-@pytest.mark.parametrize(
-    ("dtype", "dim"),
-    [(np.float32, 3), (np.float64, 2), *(pytest.param(*kind, marks=SLOW) for kind in ((np.float32, 2), (np.float64, 3)))],
-)
-def test_hard_cases(dtype, dim):
-    for name in HARD:
-        given = HARD_CASES[name].build(dtype, dim)
-        pairs = reference.reference_pairs(given.positions, given.cutoff)
-        assert_marks(marked(given.positions, given.cutoff), pairs, given.positions)
-
-
-def test_options():
-    """Queries, with particles that are not active; then closed with include_self; each where it decides something."""
-    given = HARD_CASES["queries_coincident"].build(np.float32, 3)
-    active = np.arange(LENGTH) % 3 > 0
-    pairs = reference.reference_pairs(given.positions, given.cutoff, queries=given.queries)
-    found = marked(given.positions, given.cutoff, given.queries, active=active)
-    assert_marks(found, {(i, j) for i, j in pairs if active[j]}, given.positions, given.queries)
-    given = HARD_CASES["integers_9"].build(np.float32, 3)
-    pairs = reference.reference_pairs(given.positions, given.cutoff, closed=True, include_self=True)
-    assert len(pairs) > len(reference.reference_pairs(given.positions, given.cutoff))
-    assert_marks(marked(given.positions, given.cutoff, closed=True, include_self=True), pairs, given.positions)
-
-
-@pytest.mark.parametrize(("n", "m"), [(0, None), (0, 3), (3, 0), (1, None)])
-def test_empty(n, m):
-    x, ids = np.zeros((n, 3), np.float32), np.arange(n, dtype=np.float32)
-    options = {} if m is None else {"queries": np.zeros((m, 3), np.float32), "query_values": np.arange(m, dtype=np.float32)}
-    sums = fused(marks, x, 1.0, ids, **options)
-    assert sums["r"].shape == (n if m is None else m, 3)
-    assert not any(np.asarray(leaf).any() for leaf in jax.tree.leaves(sums))
 
 
 def test_more_candidates_than_fit():
@@ -129,7 +74,7 @@ def heavy(r, i, j):
     return jnp.sin(j * jnp.linspace(0.01, 0.03, 8, dtype=j.dtype)).sum()
 
 
-@pytest.mark.parametrize("fn", [light, pytest.param(heavy, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("fn", [light, slow(heavy)])
 def test_extremes_among_more_candidates_than_fit(fn):
     """Of equal ones that of the smallest index; NaN is not hidden; rows without neighbors."""
     n = 3000
@@ -184,7 +129,7 @@ def of_all_kinds(scale, r, i, j):
     return {"turned": turned, "outer": jnp.outer(r, j["vector"]), "rest": [scale * heavy, jnp.maximum(r, 0)]}
 
 
-@pytest.mark.parametrize("dtype", [np.float32, pytest.param(np.float64, marks=SLOW)])
+@pytest.mark.parametrize("dtype", [np.float32, slow(np.float64)])
 def test_values_of_all_kinds(dtype):
     random = np.random.default_rng(1)
     x = jnp.asarray(random.random((400, 3)), dtype)
@@ -223,30 +168,18 @@ def test_rounding_of_a_density():
 # --- derivatives -------------------------------------------------------------------------------------------------------------
 
 
-def test_derivatives():
-    """Of coincident points, at ties, in empty rows; then of random points: gradient and Hessian-vector product."""
-    found = everything(lambda x, m, s: fused(functools.partial(smooth, s), x, CUTOFF, {"m": m}))
-    for seed in (0, 1):
-        args, pairs = (*scene(seed), jnp.asarray(1.3)), reference.reference_pairs(scene(seed)[0], CUTOFF)
-        along = tangents_of(args)
-        assert_same(found(args, along), oracle(smooth_slopes, pairs, dict(zip(("x", "m", "scale"), args)), along))
+@pytest.mark.parametrize("apart", [True, False])
+def test_derivatives_with_queries(apart):
+    """Where they are the particles, positions of i and of j are one array, their values and derivatives are not."""
+    (x, m), q = scene(1), jnp.asarray(np.asarray(scene(2)[0])[:23])
+    args = (x, m, jnp.asarray(np.linspace(0.3, 0.6, 23 if apart else N)), *([q] if apart else []))
+    pairs, fn = reference.reference_pairs(x, CUTOFF, queries=q if apart else x), functools.partial(cheap, 0.7)
 
+    def sums(x, m, w, *q):
+        return fused(fn, x, CUTOFF, m, queries=q[0] if apart else x, query_values=w)
 
-def test_derivatives_with_queries():
-    (x, m), q, w = scene(1), jnp.asarray(np.asarray(scene(2)[0])[:23]), jnp.asarray(np.linspace(0.3, 0.6, 23))
-    fn, args = functools.partial(cheap, 0.7), (x, q, m, w)
-    pairs = reference.reference_pairs(x, CUTOFF, queries=q)
-    along = tangents_of(args)
-    found = everything(lambda x, q, m, w: fused(fn, x, CUTOFF, m, queries=q, query_values=w), False)
-    assert_same(found(args, along), oracle(stepped(cheap_terms), pairs, dict(zip("xqmw", args)), scale=0.7))
-
-
-def test_queries_at_the_particles_have_values_of_their_own():
-    """Positions of i and of j are one array then, their values and derivatives are not."""
-    (x, m), w = scene(1), jnp.asarray(np.linspace(0.3, 0.6, N))
-    pairs, fn, args = reference.reference_pairs(x, CUTOFF, queries=x), functools.partial(cheap, 0.7), (x, m, w)
-    found = everything(lambda x, m, w: fused(fn, x, CUTOFF, m, queries=x, query_values=w), False)
-    assert_same(found(args, tangents_of(args)), oracle(stepped(cheap_terms), pairs, dict(zip("xmw", args)), scale=0.7))
+    expected = oracle(stepped(cheap_terms), pairs, dict(zip("xmwq", args)), scale=0.7)
+    assert_same(everything(sums, False)(args, tangents_of(args)), expected)
 
 
 def cheap(scale, r, i, j):
@@ -258,34 +191,6 @@ def cheap_terms(scale, r, i, j):
     """Return what `cheap` is, by NumPy, in columns."""
     s, i, j = (r * r).sum(1)[:, None], i[:, None], j[:, None]
     return np.hstack([scale * j * s * i, (scale + s) * r * j])
-
-
-def test_in_a_batch():
-    """Systems that lie in the same place."""
-    x, m = scene(1)
-    batch = np.arange(N) % 3
-    pairs = {(i, j) for i, j in reference.reference_pairs(x, CUTOFF) if batch[i] == batch[j]}
-    found = fused(functools.partial(cheap, 1.0), x, CUTOFF, m, batch=batch)
-    expected = oracle_sum(functools.partial(cheap_terms, 1.0), pairs, x, x, m, m)
-    assert_same(found, {"a": expected[:, 0], "b": expected[:, 1:]})
-
-
-def test_what_is_no_pair_poisons_nothing():
-    """fn is NaN or infinite where there is no pair, and so are values and positions of inactive particles."""
-    x, m, active = partly_active()
-
-    def fn(r, i, j):
-        return i * j / jnp.sqrt(r @ r) * jnp.sqrt(CUTOFF - jnp.sqrt(r @ r))
-
-    def terms(_, r, i, j):
-        distance = np.sqrt((r * r).sum(1))
-        return (i * j / distance * np.sqrt(CUTOFF - distance))[:, None]
-
-    pairs = {(i, j) for i, j in reference.reference_pairs(x, CUTOFF) if active[i] and active[j]}
-    args, along = (x, m), tangents_of((x, m))
-    found = everything(lambda x, m: fused(fn, x, CUTOFF, m, active=active), False)(args, along)
-    assert_same(found, oracle(stepped(terms), pairs, {"x": x, "m": m}), 1e-9)
-    assert not np.asarray(found[1][0])[~active].any()
 
 
 def test_same_bits_in_a_scan_and_again():
@@ -308,18 +213,6 @@ def test_same_bits_in_a_scan_and_again():
 
 
 # --- memory, choice of the engine, errors ------------------------------------------------------------------------------------
-
-
-def test_memory_follows_the_particles():
-    """A million particles: gradient included, some words for each, though they had hundreds of neighbors."""
-    n = 1_000_000
-
-    def loss(x, m):
-        return (fused(lambda r, i, j: j * (1 - r @ r), x, 0.1, m) ** 2).sum()
-
-    shapes = jax.ShapeDtypeStruct((n, 3), np.float32), jax.ShapeDtypeStruct((n,), np.float32)
-    memory = jax.jit(jax.grad(loss, (0, 1))).lower(*shapes).compile().memory_analysis()
-    assert memory.temp_size_in_bytes < 1e6 + 250 * n
 
 
 def sorted_norm(r, i, j):
@@ -394,8 +287,6 @@ def test_tables_are_read_by_species():
     i, j, _ = in_order(reference.reference_pairs(x, 0.3), 3)
     r, factor = x[j] - x[i], (table[kind[i], kind[j]] + table[kind[j], kind[i]])[:, None]
     by_table = np.bincount(3 * (kind[i] % 3) + kind[j] % 3, (r**2).sum(1), 9).reshape(3, 3)
-    by_place = np.zeros_like(x)
-    np.add.at(by_place, i, -2 * factor * r)
+    by_place = add_up(-2 * factor * r, i, 100)
     expected = (by_place, by_table), np.bincount(i, table[kind[i], kind[j]] * (r**2).sum(1), 100)
-    for ours, theirs in zip(jax.tree.leaves(found), jax.tree.leaves(expected)):
-        np.testing.assert_allclose(ours, theirs, rtol=1e-5, atol=1e-5)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-5), found, expected)

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from checked import refuses
 
 import jfrnn
 from jfrnn._tracing import as_array
@@ -44,30 +45,24 @@ def test_lists_are_arrays_elsewhere_too():
     assert np.asarray(corners).tolist() == [[0, 0], [1, 0]]
 
 
-def test_exclusions_that_name_nobody_are_named():
-    with pytest.raises(
-        ValueError, match=r"exclude must hold numbers of particles below 3, or -1 in padding, got \[0, 99\] in row 0"
-    ):
-        jfrnn.count(POINTS, 1.0, exclude=[[0, 99]])
-
-
-@pytest.mark.parametrize("name", ["positions", "cutoff", "queries", "active", "batch", "species", "exclude"])
+@pytest.mark.parametrize("name", ["positions", "cutoff", "queries", "active", "batch", "species", "exclude", "box", "values"])
 def test_arrays_of_others_come_by_dlpack(name):
     given = {"positions": POINTS, "cutoff": [[1.0]] if name == "species" else 1.0} | {name: Foreign()}
+    said = {"box": "lengths_or_matrix", "values": r"values\['m'\]"}.get(name, name)
     with pytest.raises(
-        TypeError, match=rf"{name} must be an array of JAX or NumPy, got test_arguments.Foreign: pass jnp.from_dlpack\({name}\)"
+        TypeError, match=rf"{said} must be an array of JAX or NumPy, got test_arguments.Foreign: pass jnp.from_dlpack\({said}\)"
     ):
-        jfrnn.count(given.pop("positions"), given.pop("cutoff"), **given)
+        if name == "box":
+            jfrnn.Box(given[name])
+        elif name == "values":
+            jfrnn.pair_sum(lambda r, i, j: j["m"], POINTS, 1.0, {"m": given[name]})
+        else:
+            jfrnn.count(given.pop("positions"), given.pop("cutoff"), **given)
 
 
-def test_boxes_of_others_are_named():
-    with pytest.raises(TypeError, match=r"pass jnp.from_dlpack\(lengths_or_matrix\)"):
-        jfrnn.Box(Foreign())
-
-
-def test_values_of_others_are_named():
-    with pytest.raises(TypeError, match=r"values\['m'\] must be an array of JAX or NumPy"):
-        jfrnn.pair_sum(lambda r, i, j: j["m"], POINTS, 1.0, {"m": Foreign()})
+def test_exclusions_that_name_nobody_are_named():
+    said = r"exclude must hold numbers of particles below 3, or -1 in padding, got \[0, 99\] in row 0"
+    refuses(ValueError, said, jfrnn.count, POINTS, 1.0, exclude=[[0, 99]])
 
 
 def test_lists_that_are_no_arrays():

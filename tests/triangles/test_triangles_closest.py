@@ -9,6 +9,7 @@ import launched
 import numpy as np
 import pytest
 import reference
+from checked import slow
 
 import jfrnn
 from jfrnn._geometry.cutoffs import make_cutoff
@@ -22,7 +23,7 @@ from jfrnn.cases import meshes
 from jfrnn.cases.triangles import TRIANGLE_CASES, padded
 from jfrnn.kernels import _compile, triangles
 
-KINDS = [pytest.param(np.float32, 3, id="f32-3d"), pytest.param(np.float64, 2, id="f64-2d", marks=pytest.mark.slow)]
+KINDS = [pytest.param(np.float32, 3, id="f32-3d"), slow(np.float64, 2, id="f64-2d")]
 PAIRS = 400
 
 
@@ -40,7 +41,7 @@ def test_distances_are_those_of_the_oracle(name, dtype, dim):
     given, eps = TRIANGLE_CASES[name].build(dtype, dim), float(np.finfo(dtype).eps)
     near = reference.triangle_pairs(given.positions, given.vertices, given.faces, given.cutoff)
     points, corners = np.zeros((PAIRS, dim), dtype), np.zeros((PAIRS, dim, dim), dtype)
-    pairs = random_part(near, PAIRS)
+    pairs = [sorted(near)[k] for k in sorted(np.random.default_rng(0).permutation(len(near))[:PAIRS])]
     points[: len(pairs)] = [given.positions[i] for i, _ in pairs]
     corners[: len(pairs)] = [given.vertices[given.faces[t]] for _, t in pairs]
     nearest, _, distance = map(np.asarray, _nearest(points, corners))
@@ -49,12 +50,6 @@ def test_distances_are_those_of_the_oracle(name, dtype, dim):
         assert abs(far - exact) <= 4 * eps * size
         apart = np.linalg.norm((here.astype(float) - point) / given.cutoff) * given.cutoff
         assert abs(apart - exact) <= 4 * eps * (size + float(np.max(np.abs(point))))
-
-
-def random_part(pairs, most):
-    """Return pairs, sorted; of more than so many a random part."""
-    pairs = sorted(pairs)
-    return [pairs[k] for k in sorted(np.random.default_rng(0).permutation(len(pairs))[:most])]
 
 
 @pytest.mark.parametrize(
@@ -164,18 +159,6 @@ def test_the_nearest_of_each_row_is_found_in_blocks_and_chunks(monkeypatch):
     slot, some = map(np.asarray, jax.jit(_triangles_rows.nearest_slots)(*given, cutoff))
     assert np.array_equal(some, mask.any(axis=1))
     assert np.array_equal(slot[some], np.where(mask, distance, np.inf).argmin(axis=1)[some])
-
-
-def test_signed_distance_in_2d():
-    vertices, faces = meshes.circle(1.0, 64)
-    x = np.random.default_rng(1).uniform(-1.4, 1.4, (200, 2))
-    tri = jfrnn.search_triangles(x, vertices, faces, 0.5, capacity=72)
-    signed = tri.signed_distance(x)
-    assert signed.watertight
-    rough = np.linalg.norm(x, axis=1) - 1
-    sure = np.asarray(signed.mask) & (np.abs(rough) > 2e-3)
-    assert sure.sum() > 50
-    assert np.array_equal(np.sign(signed.distance)[sure], np.sign(rough)[sure])
 
 
 @pytest.mark.parametrize("mesh", [meshes.circle(1.0, 8), meshes.cube(2.0, 2)], ids=["2d", "3d"])
@@ -297,10 +280,8 @@ def expected_side(x, vertices, faces, name="one"):
     return np.array([number is not None and number >= least for number in numbers]), np.array([x is None for x in numbers])
 
 
-@pytest.mark.parametrize(
-    "backend", ["bvh", pytest.param("warp", marks=pytest.mark.slow), pytest.param("jax", marks=pytest.mark.slow)]
-)
-@pytest.mark.parametrize("dtype", [np.float64, pytest.param(np.float32, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("backend", ["bvh", slow("warp"), slow("jax")])
+@pytest.mark.parametrize("dtype", [np.float64, slow(np.float32)])
 @pytest.mark.parametrize(("dim", "name"), WALLS)
 def test_signs_are_those_of_the_union(dim, name, dtype, backend):
     vertices, faces = joined(*walls(dim)[name])
@@ -353,8 +334,8 @@ def test_rays_from_within_rounding_of_a_face(dtype):
     assert 50 < expected.sum() < 150
 
 
-@pytest.mark.parametrize("dim", [2, pytest.param(3, marks=pytest.mark.slow)])  # in 3D the next test does, with one wall
-@pytest.mark.parametrize("dtype", [np.float32, pytest.param(np.float64, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("dim", [2, slow(3)])  # in 3D the next test does, with one wall
+@pytest.mark.parametrize("dtype", [np.float32, slow(np.float64)])
 def test_rays_without_warp(dim, dtype):
     """Rays of arrays tell the sides that those of kernels do, or leave them open."""
     for name, parts in walls(dim).items():
@@ -391,8 +372,8 @@ def test_rays_through_a_tree_of_many_levels():
     assert len(set(expected)) == 2
 
 
-@pytest.mark.parametrize("dim", [pytest.param(2, marks=pytest.mark.slow), 3])
-@pytest.mark.parametrize("dtype", [np.float32, pytest.param(np.float64, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("dim", [slow(2), 3])
+@pytest.mark.parametrize("dtype", [np.float32, slow(np.float64)])
 def test_kernel_for_cuda(dim, dtype):
     """It compiles for a GPU, nothing contracted; its text for the CPU tells the sides, too."""
     double = dtype == np.float64

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import launched
 import numpy as np
 import pytest
+from checked import sparing
 
 import jfrnn
 from jfrnn._engine import auto as _auto
@@ -26,8 +27,7 @@ from jfrnn.cases.triangles import TRIANGLE_CASES, padded
 from jfrnn.kernels import Program, _compile, triangles_cuda
 from jfrnn.kernels.triangles import pending
 
-KINDS = list(product((np.float32, np.float64), (2, 3)))
-OFTEN = {"warp": [(np.float32, 3), (np.float64, 2)], "bvh": [(np.float32, 2), (np.float64, 3)]}
+KINDS = {"warp": [(np.float32, 3), (np.float64, 2)], "bvh": [(np.float32, 2), (np.float64, 3)]}
 GUARD = 64  # words behind the scratch, which nobody may touch
 
 
@@ -35,9 +35,7 @@ VARIANTS = list(product((2, 3), *[(False, True)] * 3))
 PAIRWISE = [VARIANTS[k] for k in (0, 7, 11, 13, 14)]  # of any two options, each pair of what they may be stands in one
 
 
-@pytest.mark.parametrize(
-    ("dim", "double", "lists", "tree"), [pytest.param(*v, marks=[pytest.mark.slow] * (v not in PAIRWISE)) for v in VARIANTS]
-)
+@pytest.mark.parametrize(("dim", "double", "lists", "tree"), sparing(VARIANTS, PAIRWISE))
 def test_variants_compile(dim, double, lists, tree):
     """For float bounds that hold, and are those of the CPU: nothing is contracted."""
     programs = {kernel.program for kernel in triangles_cuda.triangle_kernels(dim, double, lists, tree, WIDTH)}
@@ -87,14 +85,11 @@ class Answer:
         self.near, self.queued = scratch[:2]
 
 
-def each_case():
-    for (dtype, dim), name, backend in product(KINDS, TRIANGLE_CASES, ("warp", "bvh")):
-        rarely = (dtype, dim) not in OFTEN[backend]
-        kind = f"f{8 * dtype().itemsize}-{dim}d-{name}-{backend}"
-        yield pytest.param(name, backend, dtype, dim, id=kind, marks=[pytest.mark.slow] * rarely)
+EACH = product((np.float32, np.float64), (2, 3), TRIANGLE_CASES, ("warp", "bvh"))
+OFTEN = [(*kind, name, backend) for backend, kinds in KINDS.items() for kind in kinds for name in TRIANGLE_CASES]
 
 
-@pytest.mark.parametrize(("name", "backend", "dtype", "dim"), list(each_case()))
+@pytest.mark.parametrize(("dtype", "dim", "name", "backend"), sparing(EACH, OFTEN))
 def test_hard_case(name, backend, dtype, dim):
     """What the kernels of the CPU list is what the oracle says: tests/triangles/test_triangles.py."""
     given = padded(TRIANGLE_CASES[name].build(dtype, dim))

@@ -1,10 +1,10 @@
-import doctest
-import importlib
 import math
 from itertools import pairwise
 
 import numpy as np
 import pytest
+from checked import refuses
+from scipy.spatial import KDTree
 
 from jfrnn import cases
 
@@ -43,6 +43,7 @@ def runs(marks):
         ("corners", 0.11, 28_158),
         ("corners", 0.14, 37_044),
         ("diagonal", 0.11, 29_168),
+        *((f"{kind}{tiles}", 0.11, 27_648) for kind in ("turned", "tumbled", "cut", "grown") for tiles in (2, 4, 6)),
     ],
 )
 def test_points_of_the_thesis(name, fill, points):
@@ -283,8 +284,7 @@ def test_shuffle_permutes_and_repeats():
     assert np.array_equal(mixed.positions[order], scene.positions)
     assert np.array_equal(mixed.exact.astype(np.float32), mixed.positions)
     assert (mixed.cutoff, mixed.fill, mixed.name) == (scene.cutoff, scene.fill, scene.name)
-    with pytest.raises(ValueError, match=r"seed must lie in \[0, 2147483647\], got -2"):
-        cases.shuffle(scene, -2)
+    refuses(ValueError, r"seed must lie in \[0, 2147483647\], got -2", cases.shuffle, scene, -2)
 
 
 @pytest.mark.parametrize("offset", [1000.0, (-3.0, 0.0, 17.5)])
@@ -355,11 +355,15 @@ def test_layout_functions_give_the_positions_of_their_scene():
         ("jitter", {"amplitude": 1.5}, ValueError, r"amplitude must lie in \(0, 1\], got 1.5"),
         ("clump", {"density": -1.0}, ValueError, "density must be finite and above 0, got -1.0"),
         ("clump", {"fill": 0.9, "density": 1.0}, ValueError, "more than half the shortest side.*raise density"),
+        ("turned4", {"fill": 0.3}, ValueError, r"fill=0.3 makes cubes of 8 sites .* of 12.5 sites: take 0.11 at most, or fewer"),
+        ("turned4", {"angle": float("nan")}, ValueError, "angle must be finite, got nan"),
+        ("tumbled4", {"angle": 3.0}, ValueError, "angle=3.0 is not an argument of .*'tumbled4', which takes fill, seed: drop it"),
+        ("grown4", {"growth": 0.5}, ValueError, "growth must be at least 1, got 0.5"),
+        ("turnedN", {}, ValueError, "name must be a known layout, got 'turnedN': .* clustersN, turnedN, tumbledN, cutN, grownN"),
     ],
 )
 def test_scene_says_what_is_wrong(name, options, error, match):
-    with pytest.raises(error, match=match):
-        cases.scene(name, **options)
+    refuses(error, match, cases.scene, name, **options)
 
 
 @pytest.mark.parametrize(
@@ -373,8 +377,7 @@ def test_scene_says_what_is_wrong(name, options, error, match):
     ],
 )
 def test_moved_says_what_is_wrong(options, error, match):
-    with pytest.raises(error, match=match):
-        cases.scene("corners", fill=0.001).moved(**options)
+    refuses(error, match, cases.scene("corners", fill=0.001).moved, **options)
 
 
 @pytest.mark.parametrize(
@@ -389,10 +392,65 @@ def test_moved_says_what_is_wrong(options, error, match):
 )
 def test_a_scene_by_hand_says_what_is_wrong(changes, match):
     fields = {"positions": np.zeros((2, 2)), "cutoff": 0.5, "spacing": 0.1, "lengths": (1.0, 1.0), "fill": 0.1}
-    with pytest.raises(ValueError, match=match):
-        cases.Scene("pair", **(fields | changes))
+    refuses(ValueError, match, cases.Scene, "pair", **fields | changes)
 
 
-def test_the_example_in_the_docstring():
-    result = doctest.testmod(importlib.import_module("jfrnn.cases._build"))
-    assert (result.attempted, result.failed) == (2, 0)
+DOMAIN = cases.Domain()
+
+
+def pairs_at(positions, radius):
+    return len(KDTree(positions).query_pairs(radius, output_type="ndarray"))
+
+
+@pytest.mark.parametrize("angle", [0.0, 10.0, 45.0, 90.0])
+def test_turned_cubes_keep_their_pairs(angle):
+    straight, turned = cases.turned(DOMAIN, 4, angle=0.0), cases.turned(DOMAIN, 4, angle=angle)
+    radius = 3.05 * DOMAIN.spacing  # between the distances of lattice sites: no ties
+    assert pairs_at(turned, radius) == pairs_at(straight, radius)
+    assert (turned >= 0).all()
+    assert (turned <= DOMAIN.lengths).all()
+    middle = turned.reshape(128, 216, 3).mean(axis=1)
+    assert np.allclose(middle, straight.reshape(128, 216, 3).mean(axis=1), atol=1e-12)
+    edges = np.linalg.norm(np.diff(turned.reshape(128, 6, 6, 6, 3), axis=1), axis=-1)
+    assert np.allclose(edges, DOMAIN.spacing)
+    direction = np.diff(turned.reshape(128, 6, 6, 6, 3), axis=1)[0, 0, 0, 0] / DOMAIN.spacing
+    assert np.allclose(direction, [math.cos(math.radians(angle)), math.sin(math.radians(angle)), 0], atol=1e-9)
+
+
+def test_tumbled_cubes_are_each_turned_their_own_way():
+    tumbled = cases.tumbled(DOMAIN, 4, seed=3)
+    assert pairs_at(tumbled, 3.05e-4) == pairs_at(cases.turned(DOMAIN, 4, angle=0.0), 3.05e-4)
+    cubes = tumbled.reshape(128, 6, 6, 6, 3) / DOMAIN.spacing
+    frames = np.stack([cubes[:, 1, 0, 0], cubes[:, 0, 1, 0], cubes[:, 0, 0, 1]], axis=2) - cubes[:, 0, 0, 0][:, :, None]
+    assert np.allclose(frames.transpose(0, 2, 1) @ frames, np.eye(3), atol=1e-9)
+    assert np.allclose(np.linalg.det(frames), 1.0)
+    assert np.abs(frames.mean(axis=0)).max() < 0.25  # no direction is preferred
+    assert np.array_equal(tumbled, cases.tumbled(DOMAIN, 4, seed=3))
+    assert not np.array_equal(tumbled, cases.tumbled(DOMAIN, 4, seed=4))
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("angle", [0.0, 20.0, 45.0])
+def test_cut_keeps_the_lattice_and_the_number(dim, angle):
+    domain = cases.Domain(dim=dim)
+    cut = cases.cut(domain, 2, angle=angle)
+    sites = np.rint(cut / domain.spacing).astype(int)
+    assert np.array_equal(cut, sites * domain.spacing)
+    assert (sites >= 0).all()
+    assert (sites < domain.sites).all()
+    assert len(np.unique(sites, axis=0)) == len(cut) == len(cases.turned(domain, 2))
+    clusters = sites.reshape(2 * 4 * 2 ** (dim - 2), -1, dim)
+    assert np.array_equal(clusters[0] - clusters[0].min(axis=0), clusters[-1] - clusters[-1].min(axis=0))
+    extent = np.ptp(clusters[0], axis=0) + 1
+    side = round(clusters.shape[1] ** (1 / dim))
+    assert (extent[:2] == side).all() if angle == 0 else (extent[:2] > side).all()
+
+
+@pytest.mark.parametrize("growth", [1.0, 10.0, 1e6])
+def test_grown_draws_the_cubes_apart(growth):
+    scene = cases.scene("grown4", growth=growth, dtype="float64")
+    assert scene.n == 27_648
+    assert scene.fill == pytest.approx(27_648 / 250_000 / growth)
+    assert pairs_at(scene.positions, 3.05e-4) == pairs_at(cases.turned(DOMAIN, 4, angle=0.0), 3.05e-4)
+    middle = scene.positions.reshape(128, 216, 3).mean(axis=1)
+    assert np.ptp(middle, axis=0) == pytest.approx(growth ** (1 / 3) * np.array([3 / 4, 7 / 8, 3 / 4]) * DOMAIN.lengths)

@@ -4,19 +4,20 @@ from itertools import combinations, product
 
 import numpy as np
 import pytest
+from checked import refuses, slow
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from reference import compare, is_pair, pairs_of, reference_images, reference_pairs
+from reference import is_pair, pairs_of, reference_images, reference_pairs
 
 from jfrnn.cases.hard import HARD_CASES
+from jfrnn.cases.periodic import PERIODIC_CASES
+from jfrnn.cases.triangles import TRIANGLE_CASES
 
 DTYPES = (np.float32, np.float64)
 DIMS = (2, 3)
 BUILDS = list(product(DTYPES, DIMS))
-OFTEN = [*BUILDS[1:3], *(pytest.param(*each, marks=pytest.mark.slow) for each in BUILDS[::3])]  # either width, either dimension
-IN_PARTS = pytest.mark.parametrize(
-    "builds", [BUILDS[1:3], pytest.param(BUILDS[::3], marks=pytest.mark.slow)], ids=["often", "rarely"]
-)
+OFTEN = [*BUILDS[1:3], *(slow(*each) for each in BUILDS[::3])]  # either width, either dimension
+IN_PARTS = pytest.mark.parametrize("builds", [BUILDS[1:3], slow(BUILDS[::3])], ids=["often", "rarely"])
 ULP_CASES = [name for name in HARD_CASES if name.startswith("ulp_")]
 
 
@@ -29,10 +30,6 @@ def looped_pairs(queries, sources, cutoff, closed=False):
     limit = Fraction(float(sources.dtype.type(cutoff))) ** 2
     distances = {(i, j): squared(a, b) for i, a in enumerate(queries) for j, b in enumerate(sources)}
     return {pair for pair, d2 in distances.items() if d2 < limit or (closed and d2 == limit)}
-
-
-def without_self(pairs):
-    return {(i, j) for i, j in pairs if i != j}
 
 
 def rounded(value, bits):
@@ -121,24 +118,26 @@ def test_residues_decide(residue):
     assert reference_pairs(x, 1.0, half=True, closed=True) - {(2, 3)} == near | {(0, 1)}
 
 
-@pytest.mark.parametrize("cutoff", [0.0, -1.0, math.nan, math.inf, 1e39, 1e-60])
-def test_refuses_a_cutoff_that_is_none(cutoff):
-    with pytest.raises(ValueError, match="positive and finite in float32"):
-        reference_pairs(np.zeros((2, 3), np.float32), cutoff)
-
-
-def test_refuses_points_it_cannot_read():
-    with pytest.raises(TypeError, match="float32 or float64"):
-        reference_pairs(np.zeros((2, 3), int), 1.0)
-    with pytest.raises(ValueError, match=r"shape \[n, d\]"):
-        reference_pairs(np.zeros((2, 4)), 1.0)
-    with pytest.raises(ValueError, match="give the same"):
-        reference_pairs(np.zeros((2, 3)), 1.0, queries=np.zeros((2, 2)))
-    with pytest.raises(ValueError, match="give both the same"):
-        is_pair([0.0, 0.0], [0.0, 0.0, 0.0], 1.0)
-
-
 # The oracle, against the definition
+
+POINTS = np.zeros((2, 3))
+NONE = "positive and finite in float32"  # what is said of cutoffs
+
+
+@pytest.mark.parametrize(
+    ("error", "message", "arguments", "queries"),
+    [
+        *((ValueError, NONE, (POINTS.astype(np.float32), cutoff), None) for cutoff in (0.0, -1.0, math.nan, math.inf, 1e39, 1e-60)),
+        (TypeError, "float32 or float64", (np.zeros((2, 3), int), 1.0), None),
+        (ValueError, r"shape \[n, d\]", (np.zeros((2, 4)), 1.0), None),
+        (ValueError, "give the same", (POINTS, 1.0), np.zeros((2, 2))),
+        (ValueError, "give both the same", ([0.0, 0.0], [0.0, 0.0, 0.0], 1.0), None),
+    ],
+)
+def test_refuses_what_it_cannot_read(error, message, arguments, queries):
+    with pytest.raises(error, match=message):
+        is_pair(*arguments) if len(arguments) == 3 else reference_pairs(*arguments, queries=queries)
+
 
 whole = st.integers(-6, 6).map(float)
 scaled = st.builds(math.ldexp, st.sampled_from([1.0, -1.0, 1.25, 1 + 2.0**-52]), st.integers(-1074, 1000))
@@ -154,7 +153,7 @@ coordinate = st.one_of(whole, scaled, st.floats(-3, 3, allow_subnormal=True))
 def test_equals_the_definition(points, cutoff, closed):
     x = np.array(points)
     everything = looped_pairs(x, x, cutoff, closed)
-    assert reference_pairs(x, cutoff, closed=closed) == without_self(everything)
+    assert reference_pairs(x, cutoff, closed=closed) == {(i, j) for i, j in everything if i != j}
     assert reference_pairs(x, cutoff, closed=closed, include_self=True) == everything
     assert reference_pairs(x, cutoff, closed=closed, queries=x[::-2]) == looped_pairs(x[::-2], x, cutoff, closed)
     one_by_one = product(range(len(x)), repeat=2)
@@ -289,25 +288,30 @@ def test_matrix_and_cutoff_are_rounded_once():
     assert reference_images(x.astype(float), np.float32(0.1), matrix=[0.1, 1.0], periodic=(True, True)) == images
 
 
-def test_refuses_a_lattice_that_is_none():
-    x = np.zeros((2, 3))
-    for rows in ([[1, 2, 3], [2, 4, 6], [0, 0, 1]], [[0, 0, 0], [0, 1, 0], [0, 0, 1]], [[1, 0, 0], [0, 1, 0], [1, 1, 0]]):
-        with pytest.raises(ValueError, match="linearly independent"):
-            reference_images(x, 1.0, matrix=np.array(rows, float), periodic=(True,) * 3)
-    with pytest.raises(ValueError, match="linearly independent"):
-        reference_images(x[:1, :2], 1e-20, matrix=np.array([[1.0, 3.0], [3.0, 9.0]]), periodic=(True, True))
+DEPENDENT, SHAPE = "linearly independent", r"shape \[3\] or \[3, 3\]"
+
+
+@pytest.mark.parametrize(
+    ("message", "matrix", "periodic"),
+    [
+        (DEPENDENT, [[1.0, 2, 3], [2, 4, 6], [0, 0, 1]], (True,) * 3),
+        (DEPENDENT, [[0.0, 0, 0], [0, 1, 0], [0, 0, 1]], (True,) * 3),
+        (DEPENDENT, [[1.0, 0, 0], [0, 1, 0], [1, 1, 0]], (True,) * 3),
+        (DEPENDENT, [[1.0, 3.0, 0], [3.0, 9.0, 0], [0, 0, 1]], (True, True, False)),
+        (DEPENDENT, [1.0, 0.0, 1.0], (True,) * 3),
+        ("must be finite", [1.0, np.inf, 1.0], (True,) * 3),
+        *((SHAPE, matrix, (True,) * 3) for matrix in (1.0, np.ones(2), np.ones((2, 3)))),
+        *(("one bool for each of 3 axes", np.ones(3), periodic) for periodic in ((True, True), (1, 1, 1), (0, 1, 2))),
+    ],
+)
+def test_refuses_a_lattice_that_is_none(message, matrix, periodic):
+    with pytest.raises(ValueError, match=message):
+        reference_images(np.zeros((2, 3)), 1e-20, matrix=np.array(matrix), periodic=periodic)
+
+
+def test_takes_a_lattice_that_is_nearly_none():
     nearly = np.array([[0.1, 0.3], [0.3, 0.9]])  # three times 0.3 is not 0.9 in floats
-    assert reference_images(x[:1, :2], 1e-20, matrix=nearly, periodic=(True, True)) == set()
-    with pytest.raises(ValueError, match="linearly independent"):
-        reference_images(x, 1.0, matrix=np.array([1.0, 0.0, 1.0]), periodic=(True,) * 3)
-    with pytest.raises(ValueError, match="must be finite"):
-        reference_images(x, 1.0, matrix=np.array([1.0, np.inf, 1.0]), periodic=(True,) * 3)
-    for matrix in (1.0, np.ones(2), np.ones((2, 3))):
-        with pytest.raises(ValueError, match=r"shape \[3\] or \[3, 3\]"):
-            reference_images(x, 1.0, matrix=matrix, periodic=(True,) * 3)
-    for periodic in ((True, True), (1, 1, 1), (0, 1, 2)):
-        with pytest.raises(ValueError, match="one bool for each of 3 axes"):
-            reference_images(x, 1.0, matrix=np.ones(3), periodic=periodic)
+    assert reference_images(np.zeros((1, 2)), 1e-20, matrix=nearly, periodic=(True, True)) == set()
 
 
 # Periodic images, against explicit copies and symmetries
@@ -363,8 +367,7 @@ def test_images_equal_the_definition(given, cutoff, closed):
     options = {"matrix": matrix, "periodic": periodic, "closed": closed}
     determinant = gram_determinant(matrix, periodic)
     if determinant == 0:
-        with pytest.raises(ValueError, match="linearly independent"):
-            reference_images(x, cutoff, **options)
+        refuses(ValueError, "linearly independent", reference_images, x, cutoff, **options)
         return
     if determinant < Fraction(1, 100):  # hundreds of thousands of images
         return
@@ -472,22 +475,6 @@ def test_images_far_from_the_cell():
 # Comparing
 
 
-def test_compare_takes_every_form():
-    expected = {(0, 1), (1, 0)}
-    found = [(0, 1), (2, 0)]
-    i, j = np.array(found, np.int32).T
-    for form in (found, iter(found), np.array(found), (i, j), tuple(found), set(found)):
-        assert compare(form, expected) == ({(1, 0)}, {(2, 0)})
-    assert compare([], expected) == (expected, set())
-    assert compare((i[:0], j[:0]), set()) == (set(), set())
-    assert all(type(k) is int for pair in compare((i, j), set())[1] for k in pair)
-
-
-def test_compare_refuses_repeats():
-    with pytest.raises(AssertionError, match=r"more than once: \[\(0, 1\)\]"):
-        compare([(0, 1), (1, 0), (0, 1)], set())
-
-
 def test_pairs_of_a_padded_list():
     idx = np.array([[1, 2, 3], [0, 3, 3], [3, 3, 3]], np.int32)
     assert pairs_of(idx, np.array([2, 1, 0], np.int32), 3) == [(0, 1), (0, 2), (1, 0)]
@@ -495,57 +482,60 @@ def test_pairs_of_a_padded_list():
     assert pairs_of(np.zeros((2, 0), np.int32), np.array([0, 4], np.int32), 3) == []
 
 
+ROW = np.array([[1, 2, 3]], np.int32)
+
+
 @pytest.mark.parametrize(
-    ("row", "count", "message"),
+    ("idx", "count", "message"),
     [
-        ([1, 1, 3], 2, "more than once"),
-        ([1, 2, 0], 2, "unused slots of row 0 must hold 3"),
-        ([1, 2, -1], 2, "unused slots"),
-        ([1, 3, 3], 2, "but holds"),
-        ([-1, 3, 3], 1, "but holds"),
-        ([3, 3, 3], -1, "counts -1"),
+        ([[1, 1, 3]], [2], "more than once"),
+        ([[1, 2, 0]], [2], "unused slots of row 0 must hold 3"),
+        ([[1, 2, -1]], [2], "unused slots"),
+        ([[1, 3, 3]], [2], "but holds"),
+        ([[-1, 3, 3]], [1], "but holds"),
+        ([[3, 3, 3]], [-1], "counts -1"),
+        (ROW.astype(np.int64), [1], "must be int32"),
+        (ROW, [1, 1], r"must be \[n, capacity\]"),
     ],
 )
-def test_pairs_of_refuses(row, count, message):
+def test_pairs_of_refuses(idx, count, message):
     with pytest.raises(AssertionError, match=message):
-        pairs_of(np.array([row], np.int32), np.array([count], np.int32), 3)
-
-
-def test_pairs_of_refuses_other_shapes_and_dtypes():
-    idx, count = np.zeros((2, 3), np.int32), np.zeros(2, np.int32)
-    with pytest.raises(AssertionError, match="must be int32"):
-        pairs_of(idx.astype(np.int64), count, 3)
-    with pytest.raises(AssertionError, match=r"must be \[n, capacity\]"):
-        pairs_of(idx, count[:1], 3)
+        pairs_of(np.array(idx, getattr(idx, "dtype", np.int32)), np.array(count, np.int32), 3)
 
 
 # The hard cases
 
 
-@pytest.mark.parametrize("name", HARD_CASES)
-def test_hard_case_is_what_it_says(name):
-    case = HARD_CASES[name]
+@pytest.mark.parametrize(("table", "name"), [(table, name) for table in (HARD_CASES, PERIODIC_CASES) for name in table])
+def test_case_is_what_it_says(table, name):
+    case, most = table[name], 2000 if table is HARD_CASES else 300
     assert case.name == name
     assert case.mechanism and "\n" not in case.mechanism
     for dtype, dim in BUILDS:
-        hard, again = case.build(dtype, dim), case.build(np.dtype(dtype).name, dim)
-        assert hard.cutoff == again.cutoff and type(hard.cutoff) is float
-        assert 0 < np.dtype(dtype).type(hard.cutoff) < np.inf
-        for points, repeated in ((hard.positions, again.positions), (hard.queries, again.queries)):
+        given, again = case.build(dtype, dim), case.build(np.dtype(dtype).name, dim)
+        assert given.cutoff == again.cutoff and type(given.cutoff) is float
+        assert 0 < np.dtype(dtype).type(given.cutoff) < np.inf
+        if table is PERIODIC_CASES:
+            assert given.matrix.dtype == dtype and given.matrix.shape in ((dim,), (dim, dim))
+            assert given.matrix.tobytes() == again.matrix.tobytes()
+            rows = given.matrix if given.matrix.ndim == 2 else np.diag(given.matrix)
+            assert np.isfinite(rows).all() and np.isfinite(np.linalg.inv(rows.astype(float))).all()
+            assert type(given.periodic) is tuple and len(given.periodic) == dim and {*map(type, given.periodic)} == {bool}
+        for points, repeated in ((given.positions, again.positions), (given.queries, again.queries)):
             if points is None:
                 assert repeated is None
                 continue
             assert points.dtype == dtype and points.ndim == 2 and points.shape[1] == dim
-            assert len(points) <= 2000 and np.isfinite(points).all()
+            assert len(points) <= most and np.isfinite(points).all() != name.startswith("nonfinite")
             assert points.tobytes() == repeated.tobytes()
             # so that a machine which flushes denormals can be told by the name of the case
             assert "denormal" in name or not ((points != 0) & (np.abs(points) < np.finfo(dtype).tiny)).any()
 
 
-def test_hard_cases_refuse_other_dtypes_and_dimensions():
+@pytest.mark.parametrize("case", [HARD_CASES["uniform"], PERIODIC_CASES["random"], TRIANGLE_CASES["random"]])
+def test_cases_refuse_other_dtypes_and_dimensions(case):
     for dtype, dim in ((np.float16, 3), (np.int32, 2), (np.float32, 1)):
-        with pytest.raises(ValueError, match="float32 or float64, in 2 or 3"):
-            HARD_CASES["uniform"].build(dtype, dim)
+        refuses(ValueError, "float32 or float64, in 2 or 3", case.build, dtype, dim)
 
 
 @pytest.mark.parametrize(("dtype", "dim"), OFTEN)

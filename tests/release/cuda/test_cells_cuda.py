@@ -9,6 +9,7 @@ import jax
 import launched
 import numpy as np
 import pytest
+from checked import sparing
 
 import jfrnn
 from jfrnn._engine import warp
@@ -25,11 +26,6 @@ VARIANTS += [
 FEW = [(2, False, False, False, False), (3, True, False, False, False), (2, True, False, True, False)]
 FEW += [(3, False, True, True, False), (3, False, False, True, True)]
 PAIRWISE = ["11111", "10001", "11000", "01100", "00110", "00011"]
-
-
-def sparing(variants, often):
-    """Return parameters of a test: variants that do not stand in `often` are slow."""
-    return [pytest.param(*each, marks=[pytest.mark.slow] * (each not in often)) for each in variants]
 
 
 def pairwise(columns):

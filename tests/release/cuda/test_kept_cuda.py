@@ -1,6 +1,7 @@
 """Lists that are kept, on CUDA, as far as a machine without a GPU can tell: their kernels compile for one."""
 
 import pytest
+from checked import slow
 
 from jfrnn._engine.start import load_warp
 from jfrnn.kernels import Kind, _compile, kept, reverse
@@ -31,7 +32,7 @@ def term_of(kind):
     return TermText(text, steps, (), (Value("y", dtype, 0),), others, (Sum("o", False, False), Sum("o", True, False)))
 
 
-@pytest.mark.parametrize("other", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("other", [False, slow(True)])
 @pytest.mark.parametrize("number", range(len(KINDS)), ids=[kind.name for kind in KINDS])
 def test_masks_and_sums_compile(number, other):
     """Kinds in turn with and without distances, and compensated sums; `other`: the other way round."""

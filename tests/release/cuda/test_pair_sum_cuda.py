@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from checked import slow, slowly
 
 import jfrnn
 from jfrnn._engine import boxes_warp, warp_sums
@@ -70,11 +71,11 @@ def compiles_for(plan, dim, double, **variant):
 @pytest.mark.parametrize(
     ("dim", "dtype", "variant"),
     [
-        pytest.param(3, np.float32, {}, marks=pytest.mark.slow),  # derivatives are of this kind
-        pytest.param(2, np.float32, {}, marks=pytest.mark.slow),
+        slow(3, np.float32, {}),  # derivatives are of this kind
+        slow(2, np.float32, {}),
         (3, np.float32, {"batched": True, "scaled": True}),
         (2, np.float64, {"compensated": True}),
-        pytest.param(3, np.float64, {"batched": True}, marks=pytest.mark.slow),
+        slow(3, np.float64, {"batched": True}),
     ],
 )
 def test_densities_compile(dim, dtype, variant):
@@ -82,9 +83,7 @@ def test_densities_compile(dim, dtype, variant):
     assert compiles_for(plan_of(square_sum, masses, x, scale), dim, dtype == np.float64, **variant)
 
 
-@pytest.mark.parametrize(
-    "argnums", [pytest.param(0, id="values", marks=pytest.mark.slow), pytest.param(2, id="closed over")]
-)  # in positions: in boxes, below
+@pytest.mark.parametrize("argnums", [slow(0, id="values"), pytest.param(2, id="closed over")])  # in positions: in boxes, below
 def test_derivatives_compile(argnums):
     masses, x, scale, _ = arguments(np.float32, 3)
     plan = plan_of(jax.grad(square_sum, argnums), masses, x, scale)
@@ -92,7 +91,7 @@ def test_derivatives_compile(argnums):
     assert compiles_for(plan, 3, False)
 
 
-@pytest.mark.parametrize("dtype", [pytest.param(np.float32, marks=pytest.mark.slow), np.float64])
+@pytest.mark.parametrize("dtype", [slow(np.float32), np.float64])
 def test_functions_and_values_of_all_kinds_compile(dtype):
     _, x, scale, values = arguments(dtype, 3)
     plan = plan_of(functools.partial(square_sum, fn=everything), values, x, scale)
@@ -100,9 +99,7 @@ def test_functions_and_values_of_all_kinds_compile(dtype):
     assert compiles_for(plan, 3, dtype == np.float64)
 
 
-@pytest.mark.parametrize(
-    ("dim", "dtype", "length"), [(3, np.float32, 2.0), pytest.param(2, np.float64, 0.1, marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize(("dim", "dtype", "length"), [(3, np.float32, 2.0), slow(2, np.float64, 0.1)])
 def test_terms_in_boxes_compile(dim, dtype, length):
     """Of the nearest images, and of several; the lattice shift has no column, its turns have one."""
     masses, x, scale, _ = arguments(dtype, dim)
@@ -112,9 +109,7 @@ def test_terms_in_boxes_compile(dim, dtype, length):
     assert compiles_for(plan, dim, dtype == np.float64, periodic=1 if length > CUTOFF else 2)
 
 
-@pytest.mark.parametrize(
-    ("dtype", "variant"), [pytest.param(np.float32, {}, marks=pytest.mark.slow), (np.float64, {"periodic": 2, "batched": True})]
-)
+@pytest.mark.parametrize(("dtype", "variant"), [slow(np.float32, {}), (np.float64, {"periodic": 2, "batched": True})])
 def test_extremes_compile(dtype, variant):
     masses, x, _, _ = arguments(dtype, 3)
     plan = plan_of(lambda x: jfrnn.pair_sum(poly6, x, CUTOFF, masses, reduce="min", backend="warp"), x)
@@ -129,22 +124,17 @@ def test_terms_that_read_nothing_compile():
     assert compiles_for(plan, 3, False)
 
 
-def test_what_a_term_reads_is_sorted_before_it_is_summed():
-    plan = plan_of(square_sum, *arguments(np.float32, 3)[:3])
-    kernels = pair_sum_cuda.sum_kernels(Kind(3, False), plan.text, plan.key)
-    sort_values, query = kernels.launches(1000, 500, 132)
-    assert (sort_values.kernel, query.kernel) == (kernels.sort_values, kernels.query)
-    assert query.threads == 32 * pair_sum_cuda.slots(500)
-    assert all(launch.threads % launch.kernel.block == 0 for launch in (sort_values, query))
-
-
-def test_queries_that_leave_a_box_have_a_kernel_beside_the_others():
-    masses, x, scale, _ = arguments(np.float32, 3)
-    plan = plan_of(functools.partial(square_sum, box=jfrnn.Box([2.0, 2.0, 2.0])), masses, x, scale)
-    kernels = pair_sum_cuda.sum_kernels(Kind(3, False, periodic=1), plan.text, plan.key)
+@pytest.mark.parametrize("periodic", [0, 1])
+def test_what_a_term_reads_is_sorted_before_it_is_summed(periodic):
+    """Queries that leave a box have a kernel beside the others."""
+    box = jfrnn.Box([2.0, 2.0, 2.0]) if periodic else None
+    plan = plan_of(functools.partial(square_sum, box=box), *arguments(np.float32, 3)[:3])
+    kernels = pair_sum_cuda.sum_kernels(Kind(3, False, periodic=periodic), plan.text, plan.key)
     launches = kernels.launches(1000, 500, 132)
-    assert [launch.kernel for launch in launches] == [kernels.sort_values, kernels.crossing, kernels.query]
-    assert [launch.beside for launch in launches] == [False, False, True]
+    assert [launch.kernel for launch in launches] == [kernels.sort_values, *[kernels.crossing] * periodic, kernels.query]
+    assert [launch.beside for launch in launches] == [False, False] + [True] * periodic
+    assert periodic or launches[-1].threads == 32 * pair_sum_cuda.slots(500)
+    assert all(launch.threads % launch.kernel.block == 0 for launch in launches)
 
 
 @pytest.mark.parametrize("double", [False, True])
@@ -200,20 +190,14 @@ def test_programs_for_cuda_call_it_and_plans_have_the_arguments_of_their_kernels
     assert (len(sorting.steps), len(summing.steps)) == (6, 2 + periodic)
     assert [step.beside for step in summing.steps] == [False] * (1 + periodic) + [bool(periodic)]
     words = {"info", "scratch"}
-    for found, arrays in (
-        (sorting, {*warp_sums._GIVEN[:3], *words}),
-        (summing, {*given, *words, *SUMS, "values"}),
-    ):
+    for found, arrays in ((sorting, {*warp_sums._GIVEN[:3], *words}), (summing, {*given, *words, *SUMS, "values"})):
         for step in found.steps:
             numbers = {**found.numbers, **step.numbers}
             assert {field.name for field in step.kernel.fields if field.is_array} <= arrays | {*found.absent, *SPARED}
             assert all(0 <= numbers[field.name] < 2**31 for field in step.kernel.fields if not field.is_array)
 
 
-@pytest.mark.parametrize(
-    ("rule", "boxes"),
-    [("table", True), *(pytest.param(*x, marks=pytest.mark.slow) for x in (("mean", True), ("mean", False), ("table", False)))],
-)
+@pytest.mark.parametrize(("rule", "boxes"), [("table", True), *slowly(("mean", True), ("mean", False), ("table", False))])
 def test_cutoffs_that_differ_compile_and_plans_have_the_arguments_of_their_kernels(rule, boxes):
     x, n, species = np.zeros((40, 3), np.float32), 40, np.zeros(40, np.int32)
     cutoff, given = (np.ones((2, 2), np.float32), {"species": species}) if rule == "table" else (np.ones(n, np.float32), {})

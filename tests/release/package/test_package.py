@@ -169,12 +169,7 @@ def test_links_and_pictures_of_a_package_page_lead_somewhere(wheel, tmp_path, re
 def test_command_says_which_engines_run():
     said = run("-m", "jfrnn", cwd=ROOT)
     assert f"jfrnn {jfrnn.__version__}: Python" in said
-    wanted = {
-        "jax": "pairs, sum and gradient,",
-        "warp": "pairs, sum and gradient,",
-        "hashgrid": "pairs,",
-        "brute": "pairs, sum and",
-    }
+    wanted = dict.fromkeys(("jax", "warp", "brute"), "pairs, sum and gradient,") | {"hashgrid": "pairs,", "brute": "pairs, sum and"}
     assert [name for name, what in wanted.items() if f"  {name:9} right: {what}" not in said] == []
 
 

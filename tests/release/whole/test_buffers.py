@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from checked import slow
 
 import jfrnn
 from jfrnn.cases.meshes import cube
@@ -78,7 +79,7 @@ def test_a_list_does_not_see_what_happens_to_the_arrays_it_was_made_of():
     assert int(nbrs.update(x).rebuild_count) == 1
 
 
-@pytest.mark.parametrize("backend", ["bvh", pytest.param("jax", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("backend", ["bvh", slow("jax")])
 def test_lists_of_triangles_own_their_buffers(backend):
     vertices, faces = cube()[:2]
     x, vertices, faces = points(), jnp.asarray(vertices, jnp.float32), jnp.asarray(faces, jnp.int32)

@@ -10,6 +10,7 @@ import time
 import jax
 import numpy as np
 import pytest
+from checked import slow
 from places import TESTS
 
 import jfrnn
@@ -30,19 +31,13 @@ def run(tries, *more):
     return {kind: int(times) for kind, times in zip(words[::2], words[1::2])}
 
 
-def assert_sound(found, tries):
+@pytest.mark.parametrize(("tries", "more"), [(24, ()), slow(48, ("unmapped",)), slow(300, ())])
+def test_interrupted_searches_are_right_or_raise(tries, more):
+    """Thousands of times, and without memory for instructions, too."""
+    found = run(tries, *more)
     assert (found["wrong"], found["lost"]) == (0, 0)
     assert found["interrupted"] + found["finished"] == 16 * tries
     assert min(found["interrupted"], found["finished"]) > tries  # it was raised within searches, and behind them
-
-
-def test_interrupted_searches_are_right_or_raise():
-    assert_sound(run(24), 24)
-
-
-def forget_plans():
-    for key in list(launch._plans):
-        launch._open().drop(launch._plans.pop(key))
 
 
 @pytest.mark.parametrize("backend", ["warp", "hashgrid"])
@@ -62,7 +57,8 @@ def test_what_a_handler_raises_while_python_is_asked_is_raised_when_the_call_has
         raise error
 
     error = KeyboardInterrupt("itself")
-    forget_plans()
+    for key in list(launch._plans):
+        launch._open().drop(launch._plans.pop(key))
     monkeypatch.setattr(launch, "_keep_plan", interrupted)
     before = signal.signal(signal.SIGUSR1, handle)
     try:
@@ -76,13 +72,3 @@ def test_what_a_handler_raises_while_python_is_asked_is_raised_when_the_call_has
     assert threading.main_thread() not in threads
     monkeypatch.undo()
     np.testing.assert_array_equal(count(x), right)
-
-
-@pytest.mark.slow
-def test_without_memory_for_instructions_interrupted_searches_are_right_or_raise():
-    assert_sound(run(48, "unmapped"), 48)
-
-
-@pytest.mark.slow
-def test_searches_that_are_interrupted_thousands_of_times_are_right_or_raise():
-    assert_sound(run(300), 300)

@@ -279,33 +279,17 @@ def test_every_public_name_is_in_a_mode():
     asked |= {
         "pairs_of_rows",
         "search_triangles",
-        "hilbert_encode",
-        "hilbert_decode",
-        "morton_encode",
-        "morton_decode",
-    }  # triangles, codes
+        *(f"{curve}_{way}code" for curve in ("hilbert", "morton") for way in ("en", "de")),
+    }
     functions = {name for name in jfrnn.__all__ if not isinstance(getattr(jfrnn, name), type)}
     assert sorted(functions - asked) == []
 
 
-def test_arrays_of_numpy_are_the_callers_to_move():
-    """A guard against transfers still finds those of the caller."""
-    x = np.zeros((4, 3), np.float32)
-    with jax.transfer_guard("disallow"), pytest.raises(Exception, match="Disallowed host-to-device transfer"):
-        jfrnn.count(x, 1.0)
-
-
-def test_a_guard_against_explicit_transfers_is_kept():
-    x = given()["x"]
-    with jax.transfer_guard("disallow_explicit"), pytest.raises(Exception, match="Disallowed host-to-device transfer"):
+@pytest.mark.parametrize(("guard", "x"), [("disallow", np.zeros((4, 3), np.float32)), ("disallow_explicit", given()["x"])])
+def test_guards_against_transfers_are_kept(guard, x):
+    """One still finds those of the caller, whose arrays of NumPy are his to move; one forbids explicit ones, too."""
+    with jax.transfer_guard(guard), pytest.raises(Exception, match="Disallowed host-to-device transfer"):
         jfrnn.count(x, CUTOFF)
-
-
-def test_brute_force_of_a_batch_with_64_bits():
-    """Places of particles are int32, also where JAX's default integers are wider."""
-    batch = given()["batch"]
-    nbrs = jfrnn.search(given()["x"], CUTOFF, batch=batch, backend="brute", capacity=16)
-    np.testing.assert_array_equal(nbrs.count, jfrnn.count(given()["x"], CUTOFF, batch=batch))
 
 
 @pytest.mark.parametrize("dtype", [np.int8, np.uint32, np.int64])
