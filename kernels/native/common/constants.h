@@ -63,7 +63,7 @@ constexpr bool BOXES = false;     // each system has a lattice of its own
 constexpr int BIT_NOT_FINITE = 2, BIT_OUT_OF_RANGE = 8, BIT_BOX_TOO_SMALL = 4;
 constexpr int FAR = 192, FAR_STEP = 256, FAR_MOST = 1 << 11, LARGEST_TURN = 511, MET_NOT_FINITE = 1 << 10, MET_TOO_FAR = 2 << 10;
 constexpr int FIRST_PLACE = 2368, PLACE_WORDS = 4, PLACE_WORD = 3;
-// Triangles (see jfrnn/kernels/_triangles.py, triangles_cpu.py and triangles_cuda.py).
+// Triangles (see jfrnn/kernels/triangles.py and triangles_cuda.py).
 constexpr int LIMBS = 14, ROOM = 1202, STRIDE = 1;
 constexpr int MOST_CELLS = 8, MOST_ALONG = 64, MOST_ALONG_LOG2 = 6;
 constexpr int NODE = 16, PENDING = 106, WAITING = 16, THREADS = 128, RUN = 64, HEADER = 16;
