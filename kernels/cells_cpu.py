@@ -36,7 +36,7 @@ def scratch_words(sources: int, queries: int, dim: int, width: int, own: bool, s
 
 def grid_words(systems: int, width: int) -> int:
     """Return the int32 words in which `build` keeps the grids of systems with boxes of their own (SystemGrid)."""
-    return systems * (6 * width + 8)
+    return systems * (6 * width + 10)
 
 
 @functools.lru_cache(128)

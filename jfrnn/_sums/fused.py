@@ -266,9 +266,9 @@ def _pack(group: tuple, columns: _Columns, size: int | None, dtype: np.dtype) ->
         return jnp.zeros(1 if size is None else (1, 1), dtype)
     leading = () if size is None else (size,)
     flat = [engine.as_float(jnp.reshape(x, (*leading, -1)), dtype) for x in group]
-    first = columns[0][0]
-    whole, rest = columns[: flat[first].shape[-1]], columns[flat[first].shape[-1] :]
-    if size is not None and whole == tuple((first, e) for e in range(len(whole))) and len(rest) <= _FEW_COLUMNS:
+    first, width = columns[0][0], flat[columns[0][0]].shape[-1]
+    whole, rest = tuple((first, e) for e in range(width)), columns[width:]
+    if size is not None and columns[:width] == whole and len(rest) <= _FEW_COLUMNS:
         return engine.side_by_side(flat[first], [flat[k][:, e] for k, e in rest])
     return jnp.concatenate([flat[k][..., e : e + 1] for k, e in columns], axis=-1)
 

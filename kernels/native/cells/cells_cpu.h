@@ -50,6 +50,8 @@ struct SystemGrid {
     real high[3];
     int sources, first_cell;
 };
+static_assert(sizeof(SystemGrid) <= 4 * (6 * (DOUBLE ? 2 : 1) + 10), "`grid_words` of jfrnn/kernels/cells_cpu.py");
+static_assert(sizeof(Shared) <= 4 * 64, "the head of a scratch");
 // The cells of one system at a time, where each has a box of its own. `cutoff` then holds numbers of each of them.
 struct SystemCells : Cells {
     const real* const of_systems;

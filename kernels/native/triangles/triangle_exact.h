@@ -108,7 +108,7 @@ struct Shape {
 
     // the last word: signs of polynomials in integers
     JFRNN_CALL bool surely_near(const real* p, const real* corners, real radius, int* room) {
-        Room left{room};  // how many numbers in 3D and in 2D, and products of how many coordinates: see `_NUMBERS` in kernels/triangles.py
+        Room left{room};  // how many numbers in 3D and in 2D, and products of how many coordinates: `_NUMBERS` in triangles.py
         const Wholes x = left.take(DIM == 3 ? 9 : 4, 1);
         const Wholes along = left.take(DIM == 3 ? 3 : 2, 1);
         const Wholes square = left.take(DIM == 3 ? 3 : 2, 2);
