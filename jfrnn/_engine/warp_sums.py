@@ -14,7 +14,7 @@ from jfrnn._engine.operands import (
     describe_sums,
     excluded_rows,
     kind_of_search,
-    names_of_cutoffs,
+    names_of_particles,
     names_of_tree,
     orders_for_tree,
     pack_particles,
@@ -130,8 +130,8 @@ def _sorting_callable(kind: Kind) -> Call:
         stages = cells_cuda.cell_kernels(kind).stages(numbers["n"], numbers["m"], kind.own, multiprocessors)
         return Plan(place_launches(stages), numbers | more, ["idx", "count", "starts", "receivers"])
 
-    given = (*_GIVEN[:3], *(names_of_tree(kind.rule) if kind.tree else names_of_cutoffs(kind.rule)))
-    return Call(f"jfrnn_sorting_cuda_{kind.name}", given, _WORDS, plan)
+    cutoffs = () if not kind.rule else names_of_tree(kind.rule) if kind.tree else names_of_particles(kind.rule)
+    return Call(f"jfrnn_sorting_cuda_{kind.name}", (*_GIVEN[:3], *cutoffs), _WORDS, plan)
 
 
 def _numbers(kind: Kind, term: TermText, shapes: Shapes) -> dict[str, int]:
