@@ -53,9 +53,16 @@ def difference(found: Found, exact: np.ndarray, n: int) -> tuple[np.ndarray, np.
     else:
         mine, theirs = np.sort(np.minimum(i, j) * n + np.maximum(i, j)), exact
     twice = np.concatenate((mine[1:] == mine[:-1], [False])) if len(mine) else np.zeros(0, bool)
-    extra, missing = mine[twice | ~np.isin(mine, theirs)], theirs[~np.isin(theirs, mine)]
+    extra, missing = mine[twice | ~_contains(theirs, mine)], theirs[~_contains(mine, theirs)]
     i, j = np.divmod(np.concatenate((extra, missing)), n)
     return i, j, np.repeat((1.0, -1.0), (len(extra), len(missing)))
+
+
+def _contains(where: np.ndarray, what: np.ndarray) -> np.ndarray:
+    """Return which values are in a sorted array; both are sorted, of which `np.isin` takes no advantage."""
+    if len(where) == 0:
+        return np.zeros(len(what), bool)
+    return where[np.minimum(np.searchsorted(where, what), len(where) - 1)] == what
 
 
 def sums(
