@@ -86,6 +86,11 @@ class Kind(NamedTuple):
         chosen = [value if isinstance(value, str) else _WORDS.get(field, ("", field))[value] for field, value in values if value]
         return "_".join([f"{self.dim}d", "f64" if self.double else "f32", *chosen])
 
+    @property
+    def long(self) -> bool:
+        """Whether cells on CUDA take few queries with longer cutoffs than these are made for (`native/cells/long.cuh`)."""
+        return self.rule == RULES[0] and not (self.periodic or self.batched or self.tree)
+
     def compiled(self, *without: str) -> "Kind":
         """Return what of this kind a program depends on: nothing that kernels are told when they run, nor options `without`."""
         return self._replace(**dict.fromkeys((*_TOLD, *without), 0))
@@ -106,6 +111,7 @@ class Kind(NamedTuple):
             "RULE": RULES.index(self.rule) if self.rule else -1,
             "BOXES": self.batched == OWN_BOXES,
             "TREE": self.tree,
+            "LONG": self.long,
         }
 
 

@@ -19,7 +19,7 @@ crossing the same in a periodic box, for queries whose reach leaves it: images t
 import functools
 from typing import NamedTuple
 
-from jfrnn.kernels._native import RULES, Kind, declare_kind, place_parts, table_cells
+from jfrnn.kernels._native import Kind, declare_kind, place_parts, table_cells
 from jfrnn.kernels._program import Entry, Kernel
 
 BLOCK = 256
@@ -159,11 +159,6 @@ def walking_blocks(kind: Kind) -> int:
     return 24 if not kind.lists else 16 if kind.double else 20
 
 
-def has_long(kind: Kind) -> bool:
-    """Say whether some queries may have longer cutoffs than that for which cells are made."""
-    return kind.rule == RULES[0] and not kind.periodic and not kind.batched and not kind.tree
-
-
 @functools.lru_cache(512)
 def cell_kernels(kind: Kind) -> Kernels:
     """Return the kernels that sort by cell, and that list or count."""
@@ -179,7 +174,7 @@ def cell_kernels(kind: Kind) -> Kernels:
     sorting = declare_kind(kind.only("periodic", "batched"), "cells_cuda", "cells.cuh", *stages, cuda=True, constants=GRID)
     bounds, lay_out, count, scan, scatter, gather = sorting
     find_long = mark_long = None
-    if has_long(kind):
+    if kind.long:
         steps = [Entry(f"LongQueries.{method}", BLOCK) for method in ("find", "mark")]
         of_rule = kind.only("scaled", "rule")
         find_long, mark_long = declare_kind(of_rule, "long_cuda", "long.cuh", *steps, cuda=True, constants=GRID)

@@ -11,7 +11,7 @@ import numpy as np
 from jax import Array
 
 from jfrnn._engine.launch import Call, Shapes, kernel
-from jfrnn._engine.operands import lattice_numbers, periodic_kind, scalar_of
+from jfrnn._engine.operands import lattice_numbers, periodic_kind, scalar_of, side_by_side
 from jfrnn._engine.plans import Clear, Launch, Plan, ask_for_huge_pages, share
 from jfrnn._engine.sum_results import FoundSums, Summed, SumsOf
 from jfrnn._geometry import EXCHANGED, LARGEST_TURN, Cutoff, Cutoffs, Lattice
@@ -212,10 +212,7 @@ def _beside(length: int, *parts: Array | None, more: int = 0) -> Array:
     """Return arrays of points side by side, zeros up to a length, and `more` points whose numbers are NaN."""
     given = [x if x.ndim == 2 else x[:, None] for x in parts if x is not None]
     given = [jnp.pad(x, ((0, more), (0, 0)), constant_values=jnp.nan) for x in given]
-    rows, filled = jnp.pad(given[0], ((0, 0), (0, length - given[0].shape[1]))), given[0].shape[1]
-    for column in (x[:, k] for x in given[1:] for k in range(x.shape[1])):  # on a GPU, XLA's concatenation takes twice as long
-        rows, filled = jnp.where(np.arange(length) == filled, column[:, None], rows), filled + 1
-    return rows
+    return side_by_side(given[0], [x[:, k] for x in given[1:] for k in range(x.shape[1])], length)
 
 
 @kernel

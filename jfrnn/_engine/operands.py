@@ -33,9 +33,12 @@ def particle_rows(points: Array, turns: Array | None, systems: Array | None) -> 
     return side_by_side(points, [as_float(x, points.dtype) for x in (turns, systems) if x is not None])
 
 
-def side_by_side(first: Array, columns: list[Array]) -> Array:
-    """Return an array [n, k] with columns [n] behind its own; XLA's concatenation takes at least twice as long."""
-    rows = jnp.pad(first, ((0, 0), (0, len(columns))))
+def side_by_side(first: Array, columns: list[Array], length: int | None = None) -> Array:
+    """Return an array [n, k] with columns [n] behind its own, then zeros up to a length.
+
+    XLA's concatenation takes at least twice as long.
+    """
+    rows = jnp.pad(first, ((0, 0), (0, len(columns) if length is None else length - first.shape[1])))
     for k, column in enumerate(columns, first.shape[1]):
         rows = jnp.where(np.arange(rows.shape[1]) == k, column[:, None], rows)
     return rows

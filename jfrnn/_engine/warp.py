@@ -40,7 +40,6 @@ from jfrnn._engine.start import check_warp
 from jfrnn._geometry import Cutoffs
 from jfrnn._tracing import on_platform
 from jfrnn.kernels import Kernel, Kind, _driver, cells_cpu, cells_cuda, few_cuda, tree_cpu, tree_cuda
-from jfrnn.kernels._native import RULES
 
 PLATFORMS = {"cpu": "cpu", "gpu": "cuda", "cuda": "cuda"}  # names in JAX, names of branches
 _CELLS = {"cpu": cells_cpu, "cuda": cells_cuda}
@@ -123,7 +122,8 @@ def has_order(engine: Engine, platform: str, n: int, plain: bool) -> bool:
 
 def by_cells_or_tree(cells: Callable[..., Found], tree: Callable[..., Found], search: Search, *more: tuple[Array, ...]) -> Found:
     """Search on CUDA by cells as wide as the largest cutoff if cutoffs are alike, but for few, else in a tree."""
-    of_cells = search._replace(cutoff=cutoffs_of_most(search)) if has_long(search) else search
+    long = kind_of_search(search, Filter(drop_self=False, later_only=False)).long
+    of_cells = search._replace(cutoff=cutoffs_of_most(search)) if long else search
 
     def by_cells(search: Search, largest: Array, longer: Array | None, *more: tuple[Array, ...]) -> Found:
         return cells(search._replace(cutoff=dataclasses.replace(search.cutoffs, largest=largest, longer=longer)), *more)
@@ -133,11 +133,6 @@ def by_cells_or_tree(cells: Callable[..., Found], tree: Callable[..., Found], se
 
     cutoffs = of_cells.cutoffs
     return lax.cond(cutoffs_are_alike(of_cells), by_cells, by_tree, search, cutoffs.largest, cutoffs.longer, *more)
-
-
-def has_long(search: Search) -> bool:
-    """Say whether cells take queries whose cutoffs are longer than that for which they are made."""
-    return search.cutoffs.rule == RULES[0] and search.lattice is None and search.batch is None
 
 
 def cutoffs_of_most(search: Search) -> Cutoffs:

@@ -61,7 +61,7 @@ def pair_sums(search: Search, keep: Filter, summed: Summed, values: tuple[Array,
                 make, given = _few_callable(kind, term, key), [*values, *more]
             else:
                 results, one = SumsOf(term, kind, m, pair_sum_cuda.slots(m)), kind._replace(tree=tree)
-                orders = list(of_particles.values()) if tree or cells_cuda.has_long(one) else []
+                orders = list(of_particles.values()) if tree or one.long else []
                 orders += orders_for_tree(search).values() if tree else []
                 dims = {"values": max(pair_sum_cuda.sorted_numbers(term, n, kind.dim, double), 1)}
                 make, given = _cuda_callable(one, term, key), [*values, *sort_particles(one, particles, orders), *more]
@@ -80,7 +80,7 @@ def sort_particles(kind: Kind, particles: tuple[Array, Array, Array], given: lis
     """
     n, m = len(particles[0]), len(particles[1])
     words = (tree_cuda if kind.tree else cells_cuda).scratch_words(n, m, kind.dim, 2 if kind.double else 1, kind.own)
-    more = ("rule", "tree") if kind.tree or cells_cuda.has_long(kind) else ()
+    more = ("rule", "tree") if kind.tree or kind.long else ()
     kind = kind.only("scaled", "own", "periodic", "batched", *more)
     return _sorting_callable(kind)(*particles, *given, output_dims={"info": 2, "scratch": words})
 

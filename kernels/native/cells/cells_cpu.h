@@ -178,7 +178,7 @@ struct Sort : SortArguments, Places {
             high[k] = last + beside < high[k] ? last + beside : high[k];
         }
     }
-    // Lays out a dense box without the few sources that are far from all others, if there is one: there, no cell has more than these.
+    // Lays out a dense box without the few sources that are far from all others, if there is one: these are sorted into its border.
     void leave_out_few(Grid& grid, real* low, real* high) const {
         Grid smaller;
         narrow(low, high);

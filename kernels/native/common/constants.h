@@ -68,3 +68,4 @@ constexpr int LIMBS = 14, ROOM = 1202, STRIDE = 1;
 constexpr int MOST_CELLS = 8, MOST_ALONG = 64, MOST_ALONG_LOG2 = 6;
 constexpr int NODE = 16, PENDING = 106, WAITING = 16, THREADS = 128, RUN = 64, HEADER = 16;
 constexpr bool TREE = false;  // boxes stand in a tree, not in cells
+constexpr bool LONG = true;   // some queries may have longer cutoffs than cells are made for (cells/long.cuh)

@@ -23,3 +23,13 @@ static inline long long thread_index() { return 0; }
 #define JFRNN_GENERIC  \
     template <class T> \
     JFRNN_MATH
+
+// One of two types.
+template <bool, class Yes, class No>
+struct Choice {
+    using Type = Yes;
+};
+template <class Yes, class No>
+struct Choice<false, Yes, No> {
+    using Type = No;
+};

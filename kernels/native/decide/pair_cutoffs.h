@@ -6,7 +6,6 @@
 
 constexpr bool VARY = DIFFER && RULE != GATHER;                             // the cutoffs of the pairs of a query
 constexpr bool BANDED = RULE == SCATTER || RULE == EITHER || RULE == BOTH;  // the bands of a pair are those of one of its particles
-constexpr bool LONG = RULE == GATHER && !PERIODIC && !BATCHED && !TREE;     // on CUDA, some may be longer than cells know
 constexpr bool BY_OWN = RULE == GATHER || RULE == BOTH || RULE == TABLE;    // no pair of a query is beyond its own cutoff
 
 struct PairCutoffs : Bands {

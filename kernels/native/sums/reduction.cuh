@@ -131,4 +131,4 @@ struct Largest {
     }
 };
 
-typedef ReductionOf<SUMS, Added, Largest>::type Reduction;
+using Reduction = Choice<SUMS == 2, Largest, Added>::Type;

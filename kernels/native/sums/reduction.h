@@ -74,12 +74,3 @@ struct Extreme {
         rows.put_integer(2 * at + 1, code);
     }
 };
-
-template <int WHICH, class Added, class Largest>
-struct ReductionOf {
-    typedef Added type;
-};
-template <class Added, class Largest>
-struct ReductionOf<2, Added, Largest> {
-    typedef Largest type;
-};

@@ -166,12 +166,4 @@ struct TreeRuns {
 };
 
 // Where the candidates of a group come from.
-template <bool, class Yes, class No>
-struct Choice {
-    using Type = Yes;
-};
-template <class Yes, class No>
-struct Choice<false, Yes, No> {
-    using Type = No;
-};
 using Runs = Choice<TREE, TreeRuns, Choice<LONG, MarkedRuns, CellRuns>::Type>::Type;

@@ -12,7 +12,8 @@ struct Pairs {
     bool fresh;                 // no pairs of this group have been settled
 };
 
-// Keeps a candidate, the one of a number, if it is near; `x` is where it is from the center, `source` what it is of, where that is asked.
+// Keeps a candidate, the one of a number, if it is near; `x` is where it is from the center. `source` is its own, where candidates are
+// NAMED_APART.
 JFRNN_FUNCTION void keep(
     const PairSearch& search, bool is_near, const Place& candidate, int source, const real* x, unsigned int number) {
     Warp& warp = shared_warp();
