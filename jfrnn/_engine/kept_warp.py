@@ -40,6 +40,7 @@ class KeptList(NamedTuple):
         reversal: Slots by source, where they begin, and how many: the sums are then those of the sources, over the rows that list
             them. Or None.
         systems: With a box per system, whose boxes those of the sources [n] and of the rows [m] are, or None.
+        numbers: What `numbers_of_pairs` returns of the box, if that is known, or None.
     """
 
     idx: Array
@@ -53,6 +54,7 @@ class KeptList(NamedTuple):
     order: Array | None
     reversal: tuple[Array, Array, Array] | None
     systems: tuple[Array, Array] | None = None
+    numbers: Array | None = None
 
 
 def kept_mask(given: KeptList) -> Array:
@@ -173,22 +175,23 @@ def _operands(given: KeptList, kind: ListKind, columns: int, others: Array | Non
     reversal = given.reversal or [nothing if slots is None else slots, nothing, nothing]
     order = nothing if given.order is None or not kind.ordered else given.order
     systems = nothing if given.systems is None else given.systems[0 if kind.reversed else 1]
-    return [own, points, _numbers_of(given, cutoff), steps, given.idx, given.counts, codes, *reversal, order, systems]
+    numbers = _numbers_of(given, cutoff) if given.numbers is None else given.numbers
+    return [own, points, numbers, steps, given.idx, given.counts, codes, *reversal, order, systems]
 
 
 def _numbers_of(given: KeptList, cutoff: np.floating | Array) -> Array:
-    """Return the cutoff, the numbers of the lattice and the largest number of a shift; such a row of each lattice."""
-    dtype, lattice = given.sources.dtype, given.lattice
-    radius = jnp.reshape(jnp.asarray(cutoff, dtype), 1)
-    if lattice is None:
-        return radius
+    if given.lattice is None:
+        return jnp.reshape(jnp.asarray(cutoff, given.sources.dtype), 1)
+    row = functools.partial(numbers_of_pairs, cutoff)
+    return row(given.lattice) if given.systems is None else jax.vmap(row)(given.lattice)
+
+
+def numbers_of_pairs(cutoff: np.floating | Array, lattice: Lattice) -> Array:
+    """Return the cutoff, the numbers of a lattice and the largest number of a shift, [30], skewed ones with more."""
+    dtype = lattice.matrix.dtype
+    radius, most = (jnp.full(1, x, dtype) for x in (cutoff, 2 * LARGEST_TURN + max(lattice.images.reach)))
     none, slack = jnp.ones(lattice.dim, dtype), jnp.zeros((), dtype)
-    most = jnp.full(1, 2 * LARGEST_TURN + max(lattice.images.reach), dtype)
-
-    def row(lattice: Lattice) -> Array:
-        return jnp.concatenate([radius, lattice_numbers(lattice, none, slack, lattice.flags), most])
-
-    return row(lattice) if given.systems is None else jax.vmap(row)(lattice)
+    return jnp.concatenate([radius, lattice_numbers(lattice, none, slack, lattice.flags), most])
 
 
 def _radii_of(given: KeptList, kind: ListKind) -> tuple[Array | None, Array | None]:

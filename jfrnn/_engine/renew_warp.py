@@ -13,6 +13,7 @@ import numpy as np
 from jax import Array
 
 from jfrnn._engine.auto import platform_of
+from jfrnn._engine.kept_warp import numbers_of_pairs
 from jfrnn._engine.launch import Call, Shapes, kernel
 from jfrnn._engine.operands import MOST_IN_BOX, describe_call, lattice_numbers
 from jfrnn._engine.plans import Launch, Plan
@@ -31,7 +32,9 @@ from jfrnn._geometry import (
     bound_wrapping,
     is_valid,
     make_lattice,
+    sides_of,
 )
+from jfrnn._tracing import compile_program
 from jfrnn.kernels import Kind, cells_cuda, few_cuda, renew
 
 _BITS = {"NOT_FINITE": Status.NONFINITE, "OUT_OF_RANGE": Status.OUT_OF_RANGE, "BOX_TOO_SMALL": Status.BOX_TOO_SMALL}
@@ -59,6 +62,29 @@ class KeptRows(NamedTuple):
     reference: Array
     box: Box | None
     order: Array | None
+
+
+class BoxNumbers(NamedTuple):
+    """What kernels are told of the box of a list, computed once: on a GPU, XLA moves nothing out of a loop.
+
+    Attributes:
+        search: What a search is given, [10, 30]: `numbers_of_box`.
+        pairs: What tells which slots hold a pair, [30]: `numbers_of_pairs`.
+        sides: Lengths of the edges [length], [d], 0 along open axes.
+    """
+
+    search: Array
+    pairs: Array
+    sides: Array
+
+
+@functools.partial(compile_program, static_argnames="options")
+def find_box_numbers(inputs: Inputs, cutoff: np.floating | Array, options: Options) -> BoxNumbers:
+    """Return them for such a list as `can_renew` allows, in a box; `cutoff` is that of its pairs, without a skin."""
+    if inputs.box is None or options.images is None:
+        raise TypeError("this search has no box.")
+    lattice = make_lattice(inputs.box, options.images, np.dtype(inputs.sources.dtype))
+    return BoxNumbers(numbers_of_box(inputs, options), numbers_of_pairs(cutoff, lattice), sides_of(lattice))
 
 
 def can_renew(inputs: Inputs, options: Options, capacity: int) -> bool:
@@ -94,8 +120,11 @@ def numbers_of_box(inputs: Inputs, options: Options) -> Array:
     return jax.vmap(row)(jnp.asarray(renew.MOST_TURNS, dtype))
 
 
-def renew_list(inputs: Inputs, options: Options, kept: KeptRows, limit: np.floating | Array) -> KeptRows:
-    """Return a list that holds at these positions: the same one if no point has moved by the root of `limit`, in the same box."""
+def renew_list(inputs: Inputs, options: Options, kept: KeptRows, limit: np.floating | Array, known: BoxNumbers | None) -> KeptRows:
+    """Return a list that holds at these positions: the same one if no point has moved by the root of `limit`, in the same box.
+
+    `known`: the numbers of this box, if they are known.
+    """
     now, box, cutoff, ordered = inputs.sources, inputs.box, _one_cutoff(inputs), kept.order is not None
     (n, dim), dtype = now.shape, np.dtype(now.dtype)
     few, blocks = all_meet((n, n), False), renew.blocks(n)
@@ -115,7 +144,7 @@ def renew_list(inputs: Inputs, options: Options, kept: KeptRows, limit: np.float
     if box is None:
         operands.append(jnp.full(1, cutoff.radius, dtype))
     else:
-        numbers = numbers_of_box(inputs, options)
+        numbers = numbers_of_box(inputs, options) if known is None else known.search
         operands += [numbers, *(jnp.asarray(x, dtype) for x in (box.vectors, box.origin))]
         written |= dict(zip(_KEPT_OF_BOX, jax.tree.leaves(kept.box), strict=True))
         made = {"positions": (n, dim + 1), "cutoff": numbers.shape[1] - 1}

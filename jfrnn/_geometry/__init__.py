@@ -71,6 +71,7 @@ from jfrnn._geometry.lattice import (
     make_lattice,
     nearest_shifts,
     shift_pairs,
+    sides_of,
     translation,
 )
 from jfrnn._geometry.meshes import merge_vertices

@@ -161,6 +161,11 @@ def adjugate(matrix: Array) -> Array:
     return jnp.stack([jnp.cross(rows[k - 2], rows[k - 1]) for k in range(3)], axis=-1)
 
 
+def sides_of(lattice: Lattice) -> Array:
+    """Return the lengths of the edges of a box along the axes, [..., d], 0 along open ones."""
+    return _diagonal(lattice.matrix)
+
+
 def _diagonal(matrix: Array) -> Array:
     columns = [matrix[..., k, k] for k in range(matrix.shape[-1])]  # without a gather, which would be a separate kernel
     return jnp.stack(columns, axis=-1)
@@ -203,7 +208,7 @@ def fractions_of(points: Array, lattice: Lattice) -> Array:
 def translation(shifts: Array, lattice: Lattice) -> Array:
     """Return the lattice translations shifts @ matrix, [..., d], of whole floats; differentiable in the lattice."""
     if lattice.images.orthogonal:
-        return shifts * lattice.spread(_diagonal(lattice.matrix), shifts.ndim)
+        return shifts * lattice.spread(sides_of(lattice), shifts.ndim)
     rows = [lattice.spread(lattice.matrix[..., k, :], shifts.ndim) for k in range(lattice.dim)]
     moves = [shifts[..., k, None] * rows[k] for k, p in enumerate(lattice.images.periodic) if p]
     return functools.reduce(jnp.add, moves) if moves else jnp.zeros_like(shifts)

@@ -13,7 +13,7 @@ from jax import Array, lax
 from jax.core import Tracer
 
 from jfrnn import _geometry as geometry
-from jfrnn._engine import Inputs, Options, hide_inactive, take_present
+from jfrnn._engine import BoxNumbers, Inputs, Options, hide_inactive, take_present
 from jfrnn._search.culprits import name_culprits
 from jfrnn._search.geometry import real_points
 from jfrnn._search.present import ImageCodes, Present, Reverse, Topology
@@ -37,6 +37,7 @@ class KeptSearch(KeptOptions):
     batch: geometry.Batch | None
     exclude: geometry.Exclusions | None
     reverse: Reverse | None
+    box_numbers: BoxNumbers | None
     problem: Problem = dataclasses.field(metadata={"static": True})
     _full = geometry.Status.ROW_OVERFLOW  # the bit that says that there is too little room
     _harmless = geometry.ROWS_ARE_WHOLE  # bits that do not mean missing pairs
@@ -72,6 +73,11 @@ class KeptSearch(KeptOptions):
     def _renew(self, inputs: Inputs) -> Self:
         """Let kernels decide whether the list is made anew, and make it."""
         raise NotImplementedError
+
+    def _find_box_numbers(self, inputs: Inputs) -> BoxNumbers | None:
+        """Return what kernels are told of the box if the list may renew itself."""
+        del inputs
+        return None
 
     def _pairs_held(self) -> int:
         """Return how many pairs a padded list holds."""
@@ -230,6 +236,7 @@ class KeptSearch(KeptOptions):
         with own_transfers():
             met = self._round_room(math.ceil(slack * int(np.max(np.asarray(self.required)))))
             made = _remake(wider, inputs, max(self._room, met, self._count_room(inputs, options, slack)))
+            made = _replace(made, box_numbers=made._find_box_numbers(inputs))
         made.check()
         return made
 
@@ -303,6 +310,8 @@ def _update(
     inputs = nbrs.problem.inputs(sources, queries, active, box, radii, nbrs.batch, nbrs.exclude)
     if nbrs.verlet is None:
         return _make_again(nbrs, inputs)
+    if not stays and nbrs.box_numbers is not None:
+        nbrs = _replace(nbrs, box_numbers=nbrs._find_box_numbers(inputs))
     if stays and nbrs._may_renew(inputs):
         return on_platform(nbrs, inputs, cuda=type(nbrs)._renew, default=_make_again_if_stale)
     return _make_again_if_stale(nbrs, inputs)
@@ -322,7 +331,7 @@ def _make_again_if_stale(nbrs: Kept, inputs: Inputs) -> Kept:
     radii = inputs.cutoff if isinstance(inputs.cutoff, geometry.Radii) else None
     now = hide_inactive(sources, take_present(inputs).active)
     moved = has_moved_too_far(nbrs.verlet, now, queries, box, nbrs.box_kind, radii, nbrs.skin, nbrs.batch)
-    fixed = {"box": box, "radii": radii, "batch": nbrs.batch, "exclude": nbrs.exclude}
+    fixed = {"box": box, "box_numbers": nbrs.box_numbers, "radii": radii, "batch": nbrs.batch, "exclude": nbrs.exclude}
     # what stays is no state of the loop, so that XLA derives from it once what steps of a scan need
     left_out = dict.fromkeys(fixed)
     state = moved, _replace(nbrs, **left_out)

@@ -1,6 +1,7 @@
 """The result of a search: a padded neighbor list, its checks, its geometry and its exports."""
 
 import dataclasses
+import functools
 from typing import TypedDict, Unpack, overload
 
 import jax
@@ -9,7 +10,7 @@ import numpy as np
 from jax import Array, lax
 from jax.core import Tracer
 
-from jfrnn._engine import Inputs, KeptRows, can_renew, renew_list
+from jfrnn._engine import BoxNumbers, Inputs, KeptRows, can_renew, find_box_numbers, renew_list
 from jfrnn._geometry import Box, Status, make_cutoff, pairs_and_status, shape_of, widen
 from jfrnn._search.edges import Edges, Graph, flat_edges, flat_pairs_of, make_graph, no_edges
 from jfrnn._search.exports import DenseNeighbors, check_held, check_total, flat_pairs, pair_total
@@ -17,7 +18,7 @@ from jfrnn._search.geometry import lattice_shifts, norms, vectors_of
 from jfrnn._search.kept_search import KeptSearch
 from jfrnn._search.present import MOST_SLOTS, Present, Topology, make_topology
 from jfrnn._search.problem import count_capacity, round_capacity
-from jfrnn._tracing import Points, Size, at_once, own_transfers
+from jfrnn._tracing import Points, Size, at_once, call_apart, own_transfers
 
 _FEW_SLOTS = 1 << 18  # up to which a program takes longer to compile than its displacements to compute
 
@@ -50,6 +51,7 @@ class NeighborList(KeptSearch):
         exclude: Pairs that are excluded, as rows (`Exclusions`), or None; updates keep them.
         reverse: Where pairs stand the other way round (`Reverse`), if the list was made with `reverse=True`; updates find it anew
             whenever they rebuild the list.
+        box_numbers: With a skin, in a box, on CUDA: what kernels read of the box (`BoxNumbers`); None elsewhere.
         order: The particles as they followed each other in space when the list was last rebuilt, shape [n], int32, by which sums
             over a list on a GPU go; -1 where their numbers did so. None elsewhere, and for up to 4096 particles, queries, and
             cutoffs per particle.
@@ -339,13 +341,19 @@ class NeighborList(KeptSearch):
         plain = self.reverse is None and self.images is None
         return plain and can_renew(inputs, self.problem.options, self.capacity)
 
+    def _find_box_numbers(self, inputs: Inputs) -> BoxNumbers | None:
+        if self.verlet is None or inputs.box is None or self.cutoff is None or not self._may_renew(inputs):
+            return None
+        radius = make_cutoff(self.cutoff, self.dtype, self.closed).radius
+        return call_apart(functools.partial(find_box_numbers, options=self.problem.options), inputs, radius)
+
     def _renew(self, inputs: Inputs) -> "NeighborList":
         verlet, half = self.verlet, make_cutoff(self.skin / 2, self.dtype, closed=False)
         assert verlet is not None
         limit = half.inside if self.box is None else widen(half, jnp.zeros((), self.dtype)).inside
         of_time = verlet.rebuild_count, verlet.positions, verlet.box
         kept = lax.stop_gradient(KeptRows(self.idx, self.count, self.status, self.required, *of_time, self.order))
-        new = renew_list(inputs, self.problem.options, kept, limit)
+        new = renew_list(inputs, self.problem.options, kept, limit, self.box_numbers)
         verlet = dataclasses.replace(verlet, positions=new.reference, box=new.box, rebuild_count=new.rebuild_count)
         found = {"idx": new.idx, "count": new.counts, "status": new.status, "required": new.required, "order": new.order}
         return dataclasses.replace(self, **found, verlet=verlet)

@@ -104,7 +104,8 @@ def search(
     with own_transfers():
         given = {"room": capacity, "moving": problem.skin > 0, "reversing": reverse, "flat": False}
         fields = call_apart(functools.partial(find_fields, options=problem.options, **given), inputs)
-    return NeighborList(**fields, problem=problem)
+        nbrs = NeighborList(**fields, box_numbers=None, problem=problem)
+        return dataclasses.replace(nbrs, box_numbers=nbrs._find_box_numbers(inputs)) if problem.skin > 0 else nbrs
 
 
 def search_edges(
@@ -178,7 +179,7 @@ def search_edges(
     with own_transfers():
         given = {"room": total, "moving": problem.skin > 0, "reversing": reverse, "flat": True}
         fields = call_apart(functools.partial(find_fields, options=problem.options, **given), inputs)
-    return EdgeList(**fields, problem=problem)
+    return EdgeList(**fields, box_numbers=None, problem=problem)
 
 
 def count(

@@ -37,6 +37,7 @@ class Pairs(NamedTuple):
     largest: Any  # the largest cutoff
     directionless: bool
     mark: Callable[[list[Array]], list[Array]] | None
+    sides: Array | None = None  # of the lattice, where they are known
 
 
 def pairs_of_search(problem: Problem, inputs: Inputs, summed: bool) -> Pairs:
@@ -80,6 +81,7 @@ def pairs_of_list(
         raise ValueError(f"{name} was said when the list was made: leave it out where neighbors is given.")
     if full and nbrs.half:
         raise ValueError("neighbors must be a full list for reduce='max', 'min' and compensated=True: search without half=True.")
+    known = nbrs.box_numbers if box is None and cutoff is None else None
     sources, rows, box = nbrs._geometry_inputs(positions, queries, box)
     dtype = np.dtype(sources.dtype)
     if cutoff is not None:
@@ -92,6 +94,8 @@ def pairs_of_list(
     fixed_rows = lax.stop_gradient(rows)
     directionless = not own and (nbrs.radii is None or nbrs.radii.rule not in geometry.EXCHANGED)
     relation = _relation_of_list(nbrs, *lax.stop_gradient((sources, rows, box)), symmetric=directionless and not nbrs.half)
+    if known is not None and isinstance(relation, Kept):
+        relation = dataclasses.replace(relation, given=relation.given._replace(numbers=known.pairs))
     lattice = _lattice(box, nbrs.box_kind, sources, nbrs.batch)
     sources, asking = _bring_near(sources, rows if own else None, box, nbrs.box_kind, nbrs.batch)
     rows = sources if asking is None else asking
@@ -100,7 +104,8 @@ def pairs_of_list(
     held = (nbrs.count if isinstance(nbrs, NeighborList) else jnp.diff(nbrs.offsets)) if masked and not own else None
     data, harmless = (nbrs.status, held, fixed_rows), (nbrs._harmless,)
     sources, rows, mark = _prepare_marks(sources, rows if own else None, _good_rows_of_list, data, harmless)
-    return Pairs(relation, nbrs.half, sources, rows, lattice, largest, directionless, mark)
+    sides = None if known is None else known.sides
+    return Pairs(relation, nbrs.half, sources, rows, lattice, largest, directionless, mark, sides)
 
 
 def _relation_of_list(
@@ -247,7 +252,11 @@ def _summand(
     sources, rows, lattice = pairs.sources, pairs.rows, pairs.lattice
     dtype = sources.dtype
     harmless = _along_first_axis(pairs.largest, sources.shape[1], dtype)
-    turning, each = ([], []) if lattice is None else ([], [lattice.matrix]) if lattice.images.per_system else ([lattice.matrix], [])
+    by_sides = lattice is not None and lattice.images.orthogonal and not lattice.images.per_system
+    vectors = [] if lattice is None else [lattice.matrix]
+    if by_sides and lattice is not None:
+        vectors = [geometry.sides_of(lattice) if pairs.sides is None else pairs.sides]
+    turning, each = ([], vectors) if lattice is not None and lattice.images.per_system else (vectors, [])
     same = rows is sources and mine is theirs
     numbers = [jax.ShapeDtypeStruct((len(x),), np.int32) for x in (rows, sources)]  # become arrays only if the term needs them
     (own, own_tree), (others, other_tree) = jax.tree.flatten(mine), jax.tree.flatten(theirs)
@@ -260,7 +269,8 @@ def _summand(
         matrix, own, others = [*matrix, *own[: len(each)]], own[len(each) :], others[len(theirs_too) :]
         r = x_j - x_i
         if lattice is not None:
-            r = r + geometry.translation(shift, dataclasses.replace(lattice, matrix=matrix[0]))
+            move = shift * matrix[0] if by_sides else geometry.translation(shift, dataclasses.replace(lattice, matrix=matrix[0]))
+            r = r + move
         r = jnp.where(real, r, harmless)  # for masked slots, an input for which fn raises nothing in debug modes
         i, j = jax.tree.unflatten(own_tree, own), jax.tree.unflatten(other_tree, others)
         if symmetry is None:

@@ -1,0 +1,57 @@
+"""What kernels are told of the box of a list, computed once: lists that renew themselves have it, here on the CPU as well."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jfrnn
+from jfrnn._engine import renew_warp
+from jfrnn._engine.auto import platform_of
+
+LENGTHS = np.array([3.0, 4.0, 3.5], np.float32)
+
+
+@pytest.fixture
+def as_on_cuda(monkeypatch):
+    monkeypatch.setitem(renew_warp.PLATFORMS, platform_of(jnp.zeros(1)), "cuda")
+
+
+def _energy(x, nbrs, cutoff=None, **more):
+    return jfrnn.pair_sum(lambda r, i, j: (1 - r @ r) ** 2, x, cutoff, neighbors=nbrs, **more).sum()
+
+
+@pytest.mark.usefixtures("as_on_cuda")
+@pytest.mark.parametrize("periodic", [True, (True, False, True)])
+def test_sums_and_forces_are_those_of_a_search_in_the_present_box(periodic):
+    x = jnp.asarray(np.random.default_rng(0).uniform(0, LENGTHS, (200, 3)), jnp.float32)
+    box, other = (jfrnn.Box(LENGTHS * scale, periodic=periodic) for scale in (np.float32(1), np.float32(1.04)))
+    nbrs = jfrnn.search(x, 1.0, skin=0.1, slack=1.5, box=box)
+    assert nbrs.box_numbers is not None
+    scanned = jax.jit(lambda x, nbrs: jax.lax.scan(lambda kept, _: (kept.update(x), None), nbrs, None, length=2)[0])(x, nbrs)
+    changed = jax.jit(lambda x, nbrs, box: nbrs.update(x, box))(x, nbrs, other)
+    for kept, now in ((nbrs, box), (scanned, box), (changed, other), (nbrs.grow(x, other), other)):
+        found, force = jax.jit(jax.value_and_grad(_energy))(x, kept)
+        right, slope = jax.value_and_grad(lambda x, now=now: _energy_of_search(x, now))(x)
+        np.testing.assert_allclose(found, right, rtol=1e-5)
+        np.testing.assert_allclose(force, slope, rtol=1e-4, atol=1e-4)
+        shorter = jax.jit(lambda x, kept: _energy(x, kept, cutoff=0.8))(x, kept)
+        np.testing.assert_allclose(shorter, _energy_of_search(x, now, 0.8), rtol=1e-5)
+    stretched = jax.grad(lambda lengths: _energy(x, nbrs, box=jfrnn.Box(lengths, periodic=periodic)))(jnp.asarray(LENGTHS))
+    np.testing.assert_allclose(
+        stretched,
+        jax.grad(lambda lengths: _energy_of_search(x, jfrnn.Box(lengths, periodic=periodic)))(jnp.asarray(LENGTHS)),
+        rtol=1e-3,
+    )
+
+
+def _energy_of_search(x, box, cutoff=1.0):
+    return jfrnn.pair_sum(lambda r, i, j: (1 - r @ r) ** 2, x, cutoff, box=box, backend="jax").sum()
+
+
+@pytest.mark.usefixtures("as_on_cuda")
+def test_only_lists_that_renew_themselves_have_them():
+    x, box = jnp.asarray(np.random.default_rng(1).uniform(0, LENGTHS, (50, 3)), jnp.float32), jfrnn.Box(LENGTHS)
+    for options in ({}, {"skin": 0.1, "reverse": True}, {"skin": 0.1, "backend": "jax"}, {"skin": 0.1, "active": x[:, 0] > 1}):
+        assert jfrnn.search(x, 1.0, box=box, **options).box_numbers is None
+    assert jfrnn.search(x, 1.0, skin=0.1).box_numbers is None
