@@ -88,11 +88,8 @@ def near_ties(positions, cutoff):
     return {int(a * len(points) + b) for a, b in zip(i, j, strict=True) if a < b}
 
 
-def test_coincident_particles_are_pairs(dtype):
+def test_coincident_particles_are_pairs_and_one_alone_has_none(dtype):
     assert_exact(np.zeros((5, 3), dtype), 0.1)
-
-
-def test_one_particle_has_no_pair(dtype):
     assert search(np.ones((1, 3), dtype), 1.0).shape == (0, 2)
 
 

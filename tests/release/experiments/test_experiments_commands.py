@@ -106,6 +106,12 @@ def test_list_says_what_there_is():
         (("sph", "gradients", "--evaluations", "0"), "--evaluations 0: "),
         (("run", "none.toml", "--most-seconds", "nan"), "--most-seconds nan: "),
         (("run", "none.toml", "--processes", "0"), "--processes 0: "),
+        (("export", "corners", "--out", "points.xyz"), "--out points.xyz: unknown ending '.xyz'; allowed: .csv, .vtp, .vtk"),
+        (("export", "corner", "--out", "points.csv"), "unknown layout 'corner'; allowed: full, corners, diagonal, "),
+        (("show", "clusters0"), "unknown layout 'clusters0'; allowed: full, "),
+        (("show", "corners", "--fill", "2"), "layout 'corners': fill must "),
+        (("show", "clusters9", "--spacing", "1e-3"), "layout 'clusters9': tiles must not exceed the 5 lattice sites "),
+        (("export", "corners", "--dtype", "float16", "--out", "points.csv"), "layout 'corners': dtype must be "),
         (("rum",), "No such command 'rum'. Did you mean 'run'?"),
     ],
 )
@@ -143,19 +149,6 @@ def test_a_key_in_a_table_of_a_config_is_told_what_its_table_allows(tmp_path):
     allowed = "backend, dtypes, dims, capacity, cases, least_rows"
     assert f"{path}: exactness[0].speed: unknown key (value 1); allowed: {allowed}" in lines
     assert f"{path}: exactness[0].dtypes[0]: got 'float16'; input should be 'float32' or 'float64'" in lines
-
-
-@pytest.mark.parametrize(
-    ("config", "message"),
-    [
-        ('methods = ["cll"]\ntimeout = 1e9\n[[scenes]]\nlayouts = ["full"]\n', "timeout: got 1000000000.0; "),
-        ('methods = ["cll"]\nprocesses = 0\n[[scenes]]\nlayouts = ["full"]\n', "processes: got 0; "),
-    ],
-)
-def test_a_number_of_a_config_that_is_out_of_range(tmp_path, config, message):
-    path = tmp_path / "sweep.toml"
-    path.write_text(config)
-    assert refused("run", path).startswith(f"{path}: {message}")
 
 
 def test_steps_are_timed_of_scenes_that_have_an_nx(tmp_path):

@@ -5,10 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from places import ROOT
-from typer.testing import CliRunner
 
 from experiments import _config, _layouts, _rows, _sweep, _thesis, _worker, methods
-from experiments._cli import app
 from experiments._errors import UsageError
 from experiments.pages import configs
 
@@ -112,6 +110,8 @@ def test_limits_of_time_change_no_key_but_rows_that_they_cut_short_are_wanted_ag
         ("spacing = 5e-4", "spacing = inf", r"spacing: got inf; input should be a finite number"),
         ('methods = ["scipy-kdtree", "cll"]', "", r"methods: missing; it must be given"),
         ('["full"]', "[]", r"scenes\[1\]\.layouts: got \[\]; "),
+        ("repeats = 5", "timeout = 1e9", r"sweep\.toml: timeout: got 1000000000\.0; "),
+        ("repeats = 5", "processes = 0", r"sweep\.toml: processes: got 0; "),
         ("repeats = 5", "repeats = ", r"sweep\.toml: no valid TOML: "),
     ],
 )
@@ -121,22 +121,6 @@ def test_a_config_error_names_file_key_and_what_is_allowed(tmp_path, old, new, m
         load(tmp_path, GOOD.replace(old, new))
     assert str(caught.value).startswith(str(tmp_path / "sweep.toml"))
     assert len(str(caught.value).splitlines()) == 1
-
-
-def test_a_config_that_is_not_there(tmp_path):
-    with pytest.raises(UsageError, match=r"none\.toml: cannot be read \(No such file or directory\)"):
-        _config.load(tmp_path / "none.toml")
-
-
-def test_the_command_ends_with_2_and_no_traceback(tmp_path):
-    path = tmp_path / "sweep.toml"
-    path.write_text(GOOD.replace("repeats = 5", "repeat = 5"))
-    done = CliRunner().invoke(app, ["run", str(path), "--out", str(tmp_path / "out")])
-    assert done.exit_code == 2
-    assert done.stdout == ""
-    assert done.stderr.startswith(f"error: {path}: repeat: unknown key (value 5); allowed: repeats, ")
-    assert len(done.stderr.splitlines()) == 1
-    assert not (tmp_path / "out").exists()
 
 
 def test_thesis_config_holds_every_scene_of_table_6_1():

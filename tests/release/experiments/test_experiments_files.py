@@ -77,30 +77,3 @@ def test_the_fullest_layer():
     layer, height = _show.fullest_layer(np.array([0.0, 1.0, 0.98, 2.0]) / 10, 0.1)
     assert layer.tolist() == [False, True, True, False]
     assert height == pytest.approx(0.1)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (("export", "corners", "--out", "points.xyz"), "error: --out points.xyz: unknown ending '.xyz'; allowed: .csv, .vtp, .vtk"),
-        (("export", "corner", "--out", "points.csv"), "error: unknown layout 'corner'; allowed: full, corners, diagonal, "),
-        (("show", "clusters0"), "error: unknown layout 'clusters0'; allowed: full, "),
-        (("show", "corners", "--fill", "2"), "error: layout 'corners': fill must "),
-        (("show", "clusters9", "--spacing", "1e-3"), "error: layout 'clusters9': tiles must not exceed the 5 lattice sites "),
-        (("export", "corners", "--dtype", "float16", "--out", "points.csv"), "error: layout 'corners': dtype must be "),
-    ],
-)
-def test_mistakes_end_with_2_and_a_message(tmp_path, monkeypatch, arguments, message):
-    monkeypatch.chdir(tmp_path)
-    code, out, error = invoke(*arguments)
-    assert (code, out) == (2, "")
-    assert error.startswith(message)
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_a_folder_that_cannot_be_made(tmp_path):
-    (tmp_path / "file").write_text("")
-    code, _, error = invoke("export", "corners", "--spacing", SPACING, "--out", tmp_path / "file" / "points.csv")
-    assert code == 2
-    assert "file" in error.splitlines()[0]
-    assert len(error.splitlines()) == 1

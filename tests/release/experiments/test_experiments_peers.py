@@ -63,9 +63,3 @@ def _serve_with(name, pipe):
     """Serve a peer of this file: a process of its own does not know what the test has patched."""
     peers.PEERS[name] = peers._Peer("jfrnn", {"_stop": _stop, "_sleep": _sleep}[name])
     peers._serve(name, pipe)
-
-
-def test_an_unknown_peer_is_named(tmp_path):
-    result = CliRunner().invoke(app, ["bench", "peers", "nobody", "--out", str(tmp_path)])
-    assert result.exit_code == 2
-    assert "no peer 'nobody'; allowed: jfrnn, scipy" in result.output
