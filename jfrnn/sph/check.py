@@ -182,11 +182,7 @@ def _check_turning(turning: object, dim: int) -> None:
 
 
 def check_physics(physics: Any) -> None:  # noqa: ANN401
-    """Refuse what the command line would; numbers that are traced have no value to look at.
-
-    Raises:
-        SceneError: Names the field.
-    """
+    """Refuse what the command line would, with the name of the field; numbers that are traced have no value to look at."""
     kinds = PHYSICS if isinstance(physics, fluids.Physics) else PHYSICS_OF_GASES
     for field in fields(physics):
         value = getattr(physics, field.name)

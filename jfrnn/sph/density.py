@@ -19,19 +19,10 @@ def continuity(pair: Pair, i: Values, j: Values, gradient: Array) -> Array:
 
 
 def diffusion(pair: Pair, i: Values, j: Values, strength: Array, hydrostatic: Array | None) -> Array:
-    """Return δ-SPH's diffusive part of dρ_i/dt [kg/m³/s].
+    """Return δ-SPH's diffusive part of dρ_i/dt [kg/m³/s]: δhc Σ 2 V_j (ρ_j - ρ_i - ρᴴ_ij) (x_j - x_i)·∇W/r², where ·∇W/r² is -F.
 
-    δhc Σ 2 V_j (ρ_j - ρ_i - ρᴴ_ij) (x_j - x_i)·∇W/r², with (x_j - x_i)·∇W/r² = -F.
-
-    Args:
-        pair: The pair.
-        i: Values of i.
-        j: Values of j.
-        strength: δhc [m²/s].
-        hydrostatic: ρ0 g/c² [kg/m⁴], shape [d]: the gradient of the density at rest, which is not to be diffused; None without
-            gravity.
-
-    Source: Molteni & Colagrossi (2009), doi:10.1016/j.cpc.2008.12.004; the hydrostatic part as Fourtakas et al. (2019),
+    `strength` is δhc [m²/s], `hydrostatic` ρ0 g/c² [kg/m⁴], shape [d]: the gradient of the density at rest, which is not to be
+    diffused. Source: Molteni & Colagrossi (2009), doi:10.1016/j.cpc.2008.12.004; the hydrostatic part as Fourtakas et al. (2019),
     doi:10.1016/j.compfluid.2019.06.009.
     """
     difference = j["rho"] - i["rho"]

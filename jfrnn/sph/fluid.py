@@ -34,7 +34,8 @@ def make_model(scene: FluidScene, dtype: type, backend: str, force: Force | None
 
     _check_box(scene)
     _check_parts(scene)
-    physics = jax.tree.map(array, replace(scene.physics, gravity=_row(scene.physics.gravity)))
+    gravity = None if scene.physics.gravity is None else np.asarray(scene.physics.gravity)
+    physics = jax.tree.map(array, replace(scene.physics, gravity=gravity))
     box = scene.periodic and jfrnn.Box(array(scene.periodic.lengths), scene.periodic.axes, array(scene.periodic.lower))
     return Model(
         physics=physics,
@@ -134,10 +135,6 @@ def _first_wall(wall: np.ndarray) -> int | None:
     return None if wall[:count].any() else count
 
 
-def _row(gravity: tuple[float, ...] | None) -> np.ndarray | None:
-    return None if gravity is None else np.asarray(gravity)
-
-
 def begin(model: Model, s: State, nbrs: Neighbors) -> State:
     """Return the state with what its integrator carries from step to step, at the positions and velocities that it has."""
     return _evaluate(model, s, nbrs) if model.physics.integrator == "symplectic" else s
@@ -204,19 +201,19 @@ def _evaluate(model: Model, s: State, nbrs: Neighbors, dt: Array | None = None) 
     rho = forces.densities(model, s, nbrs)
     inverse = forces.corrections(model, s, rho, nbrs)
     if dt is not None:
-        s = _carry(model, s, rho, inverse, nbrs, dt)
+        s = s._replace(**_carry(model, s, s, rho, inverse, nbrs, dt))
         rho = s.rho if s.rho is not None else rho
     a, w = forces.accelerations(model, s, forces.fields(model, s, rho, inverse, nbrs), nbrs)
     return s._replace(a=a, w=_besides(model, w, s.last if dt is None else dt))
 
 
-def _carry(model: Model, s: State, rho: Array, inverse: Array | None, nbrs: Neighbors, dt: Array) -> State:
-    """Return the state with its carried density or pressure after dt; where nothing is carried, the state."""
-    if s.rho is not None:
-        return s._replace(rho=forces.limit_tearing(model, s.rho + dt * forces.carried_rate(model, s, rho, inverse, nbrs)))
-    if s.p is not None:
-        return s._replace(p=s.p + dt * forces.carried_rate(model, s, rho, inverse, nbrs))
-    return s
+def _carry(
+    model: Model, base: State, at: State, rho: Array, inverse: Array | None, nbrs: Neighbors, dt: Array | float
+) -> dict[str, Array]:
+    """Return the density or pressure that `base` carries after dt, at the rates of `at`; nothing where none is carried."""
+    if base.rho is not None:
+        return {"rho": forces.limit_tearing(model, base.rho + dt * forces.carried_rate(model, at, rho, inverse, nbrs))}
+    return {} if base.p is None else {"p": base.p + dt * forces.carried_rate(model, at, rho, inverse, nbrs)}
 
 
 def _besides(model: Model, sums: Array | None, dt: Array) -> Array | None:
@@ -274,12 +271,7 @@ def _midpoint(model: Model, s: State, dt: Array, nbrs: Neighbors) -> tuple[State
         at = at._replace(a=a, w=_besides(model, w, dt))
         part = share * dt
         moved = base.x + part * _transport_velocity(model, at)
-        carried = {}
-        if at.rho is not None and base.rho is not None:
-            carried["rho"] = forces.limit_tearing(model, base.rho + part * forces.carried_rate(model, at, rho, inverse, nbrs))
-        elif at.p is not None and base.p is not None:
-            carried["p"] = base.p + part * forces.carried_rate(model, at, rho, inverse, nbrs)
-        at = at._replace(x=moved, v=base.v + part * a, **carried)
+        at = at._replace(x=moved, v=base.v + part * a, **_carry(model, base, at, rho, inverse, nbrs, part))
     return _bounce(model, at), nbrs
 
 

@@ -128,9 +128,8 @@ def corrections(model: Model, s: State, rho: Array, nbrs: Neighbors) -> Array | 
 def carried_rate(model: Model, s: State, rho: Array, inverse: Array | None, nbrs: Neighbors) -> Array:
     """Return the rate of the carried density [kg/m³/s] or pressure [Pa/s], shape [n]; walls have none."""
     physics, name = model.physics, "p" if s.rho is None else "rho"
-    values = {"v": s.v, "rho": rho} | {
-        key: value for key, value in (("p", s.p), ("w", s.w), ("inverse", inverse)) if value is not None
-    }
+    values = {"v": s.v, "rho": rho}
+    values |= {key: value for key, value in (("p", s.p), ("w", s.w), ("inverse", inverse)) if value is not None}
     hydrostatic = None
     if physics.gravity is not None:
         hydrostatic = physics.density * physics.gravity / physics.sound_speed**2
@@ -221,7 +220,8 @@ def accelerations(model: Model, s: State, seen: Fields, nbrs: Neighbors) -> tupl
     if physics.surface_tension is not None:
         a = a + _tension(model, s, seen.rho, nbrs, physics.surface_tension)
     if physics.damping is not None:
-        a = a - _damping(physics.damping, physics.damped_until, s.time) * s.v
+        until = physics.damped_until
+        a = a - (physics.damping if until is None else jnp.where(s.time < until, physics.damping, 0)) * s.v
     return walls.keep_fluid(are_guided(model, s), a), sums.get("w")
 
 
@@ -247,11 +247,6 @@ def _tension(model: Model, s: State, rho: Array, nbrs: Neighbors, tension: Array
     normal, known = surface.directions(n, model.physics.smoothing)
     sums = _sum(surface.bend, model, s, {"rho": rho, "normal": normal, "known": known}, nbrs)
     return surface.continuum(sums, n, known, rho, tension)
-
-
-def _damping(rate: Array, until: Array | None, time: Array) -> Array:
-    """Return the rate [1/s], shape [], at which velocities decay now."""
-    return rate if until is None else jnp.where(time < until, rate, 0)
 
 
 def density_and_pressure(model: Model, s: State, nbrs: Neighbors = None) -> tuple[Array, Array]:

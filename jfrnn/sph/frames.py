@@ -18,14 +18,8 @@ WALL = "0.75"
 def draw(scene: Scene, there: np.ndarray, x: np.ndarray, v: np.ndarray, time: float, top_speed: float, path: Path) -> None:
     """Draw particles from the side, colored by speed: the first axis to the right, the last one upwards; a solid in 3D aslant.
 
-    Args:
-        scene: The scene; its bounds are the frame.
-        there: Which particles take part, shape [n], bool.
-        x: Positions [m], shape [n, d].
-        v: Velocities [m/s], shape [n, d].
-        time: [s].
-        top_speed: Where the color scale ends [m/s].
-        path: The picture.
+    `there` says which particles take part, shape [n], bool, of positions x [m] and velocities v [m/s], shape [n, d], at a time [s].
+    The frame is the bounds of the scene, and the color scale ends at `top_speed` [m/s].
     """
     if scene.solid is not None and scene.dim == 3:
         _draw_in_space(scene, x[there], v[there], time, top_speed, path)

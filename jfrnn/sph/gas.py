@@ -11,11 +11,12 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+import jfrnn
 from jfrnn.cases.fluids import GasScene
 from jfrnn.sph import budget
 from jfrnn.sph.errors import SceneError
 from jfrnn.sph.pairs import Neighbors, Pair, Values, total_of_own
-from jfrnn.sph.particles import Force, GasModel, State, Thermal, own_acceleration
+from jfrnn.sph.particles import Beside, Force, GasModel, State, Thermal, own_acceleration
 
 COURANT = 0.3
 PASSES = 1  # of Newton's method in each step: the lengths of the step before, grown with the flow, are off by the square of a step
@@ -58,7 +59,7 @@ def make_state(scene: GasScene, dtype: type) -> State:
     return State(x, v, zero, jnp.zeros_like(x), zero, gas=Thermal(u, lengths, jnp.zeros_like(u), jnp.zeros_like(u)))
 
 
-def beside(scene: GasScene, x: Array, angle: Array | None) -> None:
+def beside(scene: GasScene, x: Array, angle: Array | None) -> Beside | None:
     """Return None: a gas here has no walls."""
 
 
@@ -120,7 +121,7 @@ def density_and_pressure(model: GasModel, s: State, nbrs: Neighbors = None) -> t
     return rho, (model.physics.heat_ratio - 1) * rho * u
 
 
-def list_neighbors(model: GasModel, s: State, skin: float, slack: float) -> None:
+def list_neighbors(model: GasModel, s: State, skin: float, slack: float) -> jfrnn.NeighborList | None:
     """Return None: cutoffs change in every step."""
 
 

@@ -33,19 +33,9 @@ def complaint(scene: Scene, s: State) -> str | None:
 
 
 def check(scene: Scene, model: Flow, before: State, nbrs: Neighbors, after: State, steps: int, first: int) -> None:
-    """Raise where a chunk of steps ended badly; its steps are run again to find the one in which it began.
+    """Raise a `DivergedError` where a chunk of steps ended badly; its steps are run again to find the one in which it began.
 
-    Args:
-        scene: The scene.
-        model: What acts.
-        before: The state before the chunk, which was well.
-        nbrs: The list then.
-        after: The state after it.
-        steps: How many steps the chunk has.
-        first: The number of steps before it.
-
-    Raises:
-        DivergedError: Names step, time and particle.
+    The chunk has so many steps after the first ones, and began with a state that was well, and the list of that time.
     """
     if (found := complaint(scene, after)) is None:
         return

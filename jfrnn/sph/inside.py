@@ -14,17 +14,10 @@ _CELL = 1.98  # reaches, the diagonal of two cells that touch
 
 
 def find_inside(points: NDArray[np.float64], reach: float, corners: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Say which points are inside a closed solid, none of whose faces is within reach of them.
+    """Say which points [m], shape [n, d], are inside a closed solid, none of whose faces is within reach [m] of them; shape [n].
 
-    Inside is where the winding number is 1 or more; of a solid around the fluid, which encloses a negative volume, 0 or more.
-
-    Args:
-        points: Where [m], shape [n, d].
-        reach: Distance [m].
-        corners: Of the faces [m], shape [f, d, d], counterclockwise as seen from outside.
-
-    Returns:
-        Shape [n].
+    Inside is where the winding number is 1 or more; of a solid around the fluid, which encloses a negative volume, 0 or more. Faces
+    are given by their corners [m], shape [f, d, d], counterclockwise as seen from outside.
     """
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components

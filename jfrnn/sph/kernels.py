@@ -52,62 +52,6 @@ def below(edge: float, q: Array) -> Array:
     return jnp.maximum(edge - q, 0.0)
 
 
-def _cubic(q: Array) -> Array:
-    return 0.25 * below(2, q) ** 3 - below(1, q) ** 3
-
-
-def _cubic_derivative(q: Array) -> Array:
-    return -0.75 * below(2, q) ** 2 + 3 * below(1, q) ** 2
-
-
-def _quintic(q: Array) -> Array:
-    return below(3, q) ** 5 - 6 * below(2, q) ** 5 + 15 * below(1, q) ** 5
-
-
-def _quintic_derivative(q: Array) -> Array:
-    return -5 * below(3, q) ** 4 + 30 * below(2, q) ** 4 - 75 * below(1, q) ** 4
-
-
-def _wendland2(q: Array) -> Array:
-    return (below(2, q) / 2) ** 4 * (2 * q + 1)
-
-
-def _wendland2_over_q(q: Array) -> Array:
-    return -5 * (below(2, q) / 2) ** 3
-
-
-def _wendland4(q: Array) -> Array:
-    return (below(2, q) / 2) ** 6 * (35 / 12 * q**2 + 3 * q + 1)
-
-
-def _wendland4_over_q(q: Array) -> Array:
-    return -(7 / 3) * (2 + 5 * q) * (below(2, q) / 2) ** 5
-
-
-def _wendland6(q: Array) -> Array:
-    return (below(2, q) / 2) ** 8 * (4 * q**3 + 25 / 4 * q**2 + 4 * q + 1)
-
-
-def _wendland6_over_q(q: Array) -> Array:
-    return -(11 / 4) * (2 + 7 * q + 8 * q**2) * (below(2, q) / 2) ** 7
-
-
-def _poly6(q: Array) -> Array:
-    return jnp.maximum(1 - q**2, 0.0) ** 3
-
-
-def _poly6_derivative(q: Array) -> Array:
-    return -6 * q * jnp.maximum(1 - q**2, 0.0) ** 2
-
-
-def _spiky(q: Array) -> Array:
-    return below(1, q) ** 3
-
-
-def _spiky_derivative(q: Array) -> Array:
-    return -3 * below(1, q) ** 2
-
-
 def _wendland(norm: tuple[float, float], shape: Callable[[Array], Array], over_q: Callable[[Array], Array]) -> Kernel:
     return Kernel(2.0, norm, shape, lambda q: q * over_q(q), _WENDLAND, over_q)
 
@@ -116,13 +60,31 @@ _MONAGHAN = "Monaghan (1992), doi:10.1146/annurev.aa.30.090192.002551"
 _SCHOENBERG = "Schoenberg (1946) B-spline; Morris, Fox & Zhu (1997), doi:10.1006/jcph.1997.5776"
 _WENDLAND = "Wendland (1995), doi:10.1007/BF02123482; Dehnen & Aly (2012), doi:10.1111/j.1365-2966.2012.21439.x"
 _MUELLER = "Müller, Charypar & Gross (2003), doi:10.2312/SCA03/154-159"
-
+# q -> shape(q), and q -> shape'(q), of Wendland's kernels over q
+_SHAPES: dict[str, tuple[Callable[[Array], Array], Callable[[Array], Array]]] = {
+    "cubic": (lambda q: 0.25 * below(2, q) ** 3 - below(1, q) ** 3, lambda q: -0.75 * below(2, q) ** 2 + 3 * below(1, q) ** 2),
+    "quintic": (
+        lambda q: below(3, q) ** 5 - 6 * below(2, q) ** 5 + 15 * below(1, q) ** 5,
+        lambda q: -5 * below(3, q) ** 4 + 30 * below(2, q) ** 4 - 75 * below(1, q) ** 4,
+    ),
+    "wendland2": (lambda q: (below(2, q) / 2) ** 4 * (2 * q + 1), lambda q: -5 * (below(2, q) / 2) ** 3),
+    "wendland4": (
+        lambda q: (below(2, q) / 2) ** 6 * (35 / 12 * q**2 + 3 * q + 1),
+        lambda q: -(7 / 3) * (2 + 5 * q) * (below(2, q) / 2) ** 5,
+    ),
+    "wendland6": (
+        lambda q: (below(2, q) / 2) ** 8 * (4 * q**3 + 25 / 4 * q**2 + 4 * q + 1),
+        lambda q: -(11 / 4) * (2 + 7 * q + 8 * q**2) * (below(2, q) / 2) ** 7,
+    ),
+    "poly6": (lambda q: jnp.maximum(1 - q**2, 0.0) ** 3, lambda q: -6 * q * jnp.maximum(1 - q**2, 0.0) ** 2),
+    "spiky": (lambda q: below(1, q) ** 3, lambda q: -3 * below(1, q) ** 2),
+}
 KERNELS = {
-    "cubic": Kernel(2.0, (10 / (7 * math.pi), 1 / math.pi), _cubic, _cubic_derivative, _MONAGHAN),
-    "quintic": Kernel(3.0, (7 / (478 * math.pi), 1 / (120 * math.pi)), _quintic, _quintic_derivative, _SCHOENBERG),
-    "wendland2": _wendland((7 / (4 * math.pi), 21 / (16 * math.pi)), _wendland2, _wendland2_over_q),
-    "wendland4": _wendland((9 / (4 * math.pi), 495 / (256 * math.pi)), _wendland4, _wendland4_over_q),
-    "wendland6": _wendland((78 / (28 * math.pi), 1365 / (512 * math.pi)), _wendland6, _wendland6_over_q),
-    "poly6": Kernel(1.0, (4 / math.pi, 315 / (64 * math.pi)), _poly6, _poly6_derivative, _MUELLER),
-    "spiky": Kernel(1.0, (10 / math.pi, 15 / math.pi), _spiky, _spiky_derivative, _MUELLER),
+    "cubic": Kernel(2.0, (10 / (7 * math.pi), 1 / math.pi), *_SHAPES["cubic"], _MONAGHAN),
+    "quintic": Kernel(3.0, (7 / (478 * math.pi), 1 / (120 * math.pi)), *_SHAPES["quintic"], _SCHOENBERG),
+    "wendland2": _wendland((7 / (4 * math.pi), 21 / (16 * math.pi)), *_SHAPES["wendland2"]),
+    "wendland4": _wendland((9 / (4 * math.pi), 495 / (256 * math.pi)), *_SHAPES["wendland4"]),
+    "wendland6": _wendland((78 / (28 * math.pi), 1365 / (512 * math.pi)), *_SHAPES["wendland6"]),
+    "poly6": Kernel(1.0, (4 / math.pi, 315 / (64 * math.pi)), *_SHAPES["poly6"], _MUELLER),
+    "spiky": Kernel(1.0, (10 / math.pi, 15 / math.pi), *_SHAPES["spiky"], _MUELLER),
 }

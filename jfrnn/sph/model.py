@@ -1,5 +1,6 @@
 """The first model and state of a scene, and the one place that tells the two kinds of flows apart: a fluid, and a gas."""
 
+from collections.abc import Callable
 from typing import Any, Protocol, overload
 
 import jax
@@ -20,41 +21,24 @@ __all__ = ["Kind", "Model", "State", "kind_of", "make_model", "make_state"]
 class Kind(Protocol):
     """What a kind of flow does with its scenes, models and states; the modules `fluid` and `gas` are the two that there are."""
 
-    def make_model(self, scene: Any, dtype: type, backend: str, force: Force | None) -> Any:  # noqa: ANN401
-        """Put what acts in a scene into JAX."""
-        ...
-
-    def make_state(self, scene: Any, dtype: type) -> State:  # noqa: ANN401
-        """Put the particles of a scene into JAX."""
-        ...
-
-    def beside(self, scene: Any, x: Array, angle: Array | None) -> Beside | None:  # noqa: ANN401
-        """Look at the wall of triangles, turned by an angle [rad], from positions [m], shape [n, d]; None where there is none."""
-        ...
-
-    def begin(self, model: Any, s: State, nbrs: Neighbors) -> State:  # noqa: ANN401
-        """Return the state with what steps carry on."""
-        ...
-
-    def courant(self, model: Any, s: State) -> Array:  # noqa: ANN401
-        """Return the step [s], shape [], that is stable."""
-        ...
-
-    def step(self, model: Any, s: State, dt: Array, nbrs: Neighbors) -> tuple[State, Neighbors]:  # noqa: ANN401
-        """Advance by a step [s]."""
-        ...
-
-    def density_and_pressure(self, model: Any, s: State, nbrs: Neighbors) -> tuple[Array, Array]:  # noqa: ANN401
-        """Return densities [kg/m³] and pressures [Pa], shape [n] each."""
-        ...
-
-    def list_neighbors(self, model: Any, s: State, skin: float, slack: float) -> jfrnn.NeighborList | None:  # noqa: ANN401
-        """Return a neighbor list with a skin [m]; None where no list serves two steps."""
-        ...
-
-    def energies(self, model: Any, s: State) -> dict[str, Array]:  # noqa: ANN401
-        """Return energies [J; in 2D J/m], shape [] each, by name."""
-        ...
+    make_model: Callable[[Any, type, str, Force | None], Any]
+    """Put what acts in a scene into JAX."""
+    make_state: Callable[[Any, type], State]
+    """Put the particles of a scene into JAX."""
+    beside: Callable[[Any, Array, Array | None], Beside | None]
+    """Look at the wall of triangles, turned by an angle [rad], from positions [m], shape [n, d]; None where there is none."""
+    begin: Callable[[Any, State, Neighbors], State]
+    """Return the state with what steps carry on."""
+    courant: Callable[[Any, State], Array]
+    """Return the step [s], shape [], that is stable."""
+    step: Callable[[Any, State, Array, Neighbors], tuple[State, Neighbors]]
+    """Advance by a step [s]."""
+    density_and_pressure: Callable[[Any, State, Neighbors], tuple[Array, Array]]
+    """Return densities [kg/m³] and pressures [Pa], shape [n] each."""
+    list_neighbors: Callable[[Any, State, float, float], jfrnn.NeighborList | None]
+    """Return a neighbor list with a skin [m] and so much slack; None where no list serves two steps."""
+    energies: Callable[[Any, State], dict[str, Array]]
+    """Return energies [J; in 2D J/m], shape [] each, by name."""
 
 
 def choose_dtype(dtype: Any) -> type:  # noqa: ANN401

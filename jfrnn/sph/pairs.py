@@ -93,19 +93,10 @@ def total(
     nbrs: Neighbors = None,
     **options: Any,  # noqa: ANN401
 ) -> Any:  # noqa: ANN401
-    """Sum a term over the neighbors of each particle.
+    """Sum a term over the neighbors of each particle: (pair, values of i, values of j) -> a pytree of arrays; leaves [n, ...].
 
-    Args:
-        term: (pair, values of i, values of j) -> a pytree of arrays.
-        x: Positions [length], shape [n, d].
-        values: Arrays of shape [n, ...], that the term reads.
-        kernel: Gives the pair its weights and, by its support, the cutoff.
-        h: Smoothing length, static.
-        nbrs: A list or edges, whose pairs are taken; None: they are found anew by `jfrnn.pair_sum`, and no list is made.
-        **options: Of `jfrnn.pair_sum`, where no list is given: box, active.
-
-    Returns:
-        What the term returns, leaves [n, ...].
+    Positions are [n, d], values arrays [n, ...], the smoothing length [length] is static, and the cutoff is the kernel's support.
+    Pairs are those of a list or of edges; where none is given, `jfrnn.pair_sum` finds them, with `options` of it: box, active.
     """
 
     def fn(r: Array, i: Values, j: Values) -> Any:  # noqa: ANN401
@@ -127,19 +118,10 @@ def total_of_own(
     rule: Literal["gather", "either"],
     backend: Any = "auto",  # noqa: ANN401
 ) -> Any:  # noqa: ANN401
-    """Sum a term over the neighbors of each particle, where each particle has its own smoothing length.
+    """Sum a term over the neighbors of each particle, where each has its own smoothing length h [length], shape [n].
 
-    Args:
-        term: (the pair as i weighs it, with h_i, and as j does, with h_j; values of i, values of j) -> a pytree of arrays.
-        x: Positions [length], shape [n, d].
-        values: Arrays of shape [n, ...], that the term reads.
-        kernel: Gives the pairs their weights and, by its support, the cutoffs.
-        h: Smoothing lengths [length], shape [n].
-        rule: "gather": j is a neighbor of i within the support of i; "either": within that of i or of j.
-        backend: Of `jfrnn.pair_sum`.
-
-    Returns:
-        What the term returns, leaves [n, ...]; differentiable in x, values and h.
+    The term reads the pair as i weighs it, with h_i, and as j does, with h_j, then the values of i and j. By the rule "gather" j is
+    a neighbor of i within the support of i, by "either" within that of i or of j. Differentiable in x, values and h.
     """
 
     def fn(r: Array, i: Values, j: Values) -> Any:  # noqa: ANN401

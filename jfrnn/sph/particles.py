@@ -203,11 +203,7 @@ def mass_there(model: Flow, s: State) -> Array:
 
 
 def own_acceleration(model: Flow, s: State) -> Array | None:
-    """Return what the own force of a model says [m/s²], shape [n, d]; None where it has none.
-
-    Raises:
-        SceneError: It has another shape.
-    """
+    """Return what the own force of a model says [m/s²], shape [n, d]; None where it has none, a `SceneError` if shapes differ."""
     if model.force is None:
         return None
     a = jnp.asarray(model.force(s))

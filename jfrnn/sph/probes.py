@@ -143,11 +143,7 @@ def _check_vector(name: str, value: Sequence[float], count: int) -> np.ndarray:
 
 
 def check_names(probes: dict[str, Probe]) -> None:
-    """Refuse what are no functions by names that can stand in the head of a table.
-
-    Raises:
-        SceneError: Says which one.
-    """
+    """Refuse what are no functions by names that can stand in the head of a table."""
     if not isinstance(probes, dict):
         raise SceneError(f"probes must be a dict of functions by name, got {type(probes).__name__}.")
     for name, probe in probes.items():

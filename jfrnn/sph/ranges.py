@@ -49,12 +49,7 @@ _SIGNS = {"gt": "above", "ge": "from", "lt": "below", "le": "to"}
 
 
 def read(kind: Any, value: object, bounds: Bounds | None) -> Any:  # noqa: ANN401
-    """Return a value as its type says, within bounds.
-
-    Args:
-        kind: Annotation of the setting.
-        value: What came, as JSON has it, or a text.
-        bounds: From `RANGES`; None for what is no number.
+    """Return a value, as JSON has it or a text, as its annotation says, within bounds of `RANGES`; None for what is no number.
 
     Raises:
         ValueError: In a line, what the value is not, and its range.

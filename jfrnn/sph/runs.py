@@ -46,11 +46,7 @@ class How:
     hdf: bool = False
 
     def __post_init__(self) -> None:
-        """Refuse what the command line would.
-
-        Raises:
-            SceneError: Names the field.
-        """
+        """Refuse what the command line would: a `SceneError` names the field."""
         kinds = {"frames": int, "lines": int, "skin": float, "neighbors": Literal["auto", "pair_sum", "list"]}
         kinds |= {"pictures": bool, "hdf": bool}
         bounds = {"frames": ranges.MANY, "lines": ranges.MANY, "skin": ranges.SKIN}
@@ -176,11 +172,7 @@ def _describe(scene: Scene, how: How, dtype: type) -> dict[str, Any]:
 
 
 def _first_neighbors(scene: Scene, model: Flow, s: State, how: How) -> Neighbors:
-    """Return a list where sums over one are asked for or faster; the smoothing lengths of a gas change in every step.
-
-    Raises:
-        SceneError: A list is asked for, of a gas.
-    """
+    """Return a list where sums over one are asked for or faster; refuse one where pairs change in every step, as in a gas."""
     way = faster_way(jax.default_backend(), scene.n) if how.neighbors == "auto" else how.neighbors
     nbrs = solver.list_neighbors(model, s, how.skin * scene.spacing) if way == "list" else None
     if how.neighbors == "list" and nbrs is None:

@@ -15,11 +15,7 @@ _WHOLE = "whole"  # an attribute outside of what the format says: whether the la
 
 
 def check_library() -> None:
-    """Raise where h5py is not installed.
-
-    Raises:
-        SceneError: Says what to install.
-    """
+    """Raise where h5py is not installed, saying what to install."""
     try:
         import h5py  # noqa: F401
     except ImportError as error:

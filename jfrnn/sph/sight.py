@@ -46,12 +46,9 @@ class Sight:
 
 
 def make_room(required: np.ndarray, neighbors: float, most: int) -> Sight:
-    """Return a sight without pairs.
+    """Return a sight without pairs, with room for half as many again as `required`, as in `Sight`, of at most so many particles.
 
-    Args:
-        required: What there must be room for, as in `Sight`; there will be for half as many again.
-        neighbors: That a particle in the fluid has.
-        most: Particles.
+    `neighbors` is how many a particle in the fluid has.
     """
     near = min(max(_LEAST, round(required[0] * _ROOM)), most)
     pairs = max(near * neighbors / 3, required[1] * _ROOM)
@@ -91,10 +88,7 @@ def _normals(corners: np.ndarray) -> np.ndarray:
 def is_thin(corners: np.ndarray, asked: tuple[np.ndarray, np.ndarray], tri: jfrnn.TriangleList) -> bool:
     """Say whether faces that look away from each other, with the solid between them, are closer than the cutoff.
 
-    Args:
-        corners: Of faces [length], shape [f, d, d].
-        asked: From `points_to_ask`.
-        tri: The triangles near those points.
+    Faces are given by their corners [length], shape [f, d, d]; points from `points_to_ask` are asked, near which `tri` lists them.
     """
     points, faces = asked
     normals = _normals(corners)
@@ -113,14 +107,10 @@ def is_thin(corners: np.ndarray, asked: tuple[np.ndarray, np.ndarray], tri: jfrn
 
 @jax.jit
 def look(room: Sight, tri: jfrnn.TriangleList, x: Array, normal: Array, there: Array | None) -> Sight:
-    """Find the pairs of particles that the solid parts.
+    """Find the pairs of particles that the solid parts, at positions in its frame [m], shape [n, d], of those that are there.
 
-    Args:
-        room: Room for so many.
-        tri: The triangles near these positions; its cutoff is that of the pairs.
-        x: Positions in the frame of the solid [m], shape [n, d].
-        normal: About away from the solid, shape [n, d]: with it most pairs on one side are told from others at once.
-        there: Which particles take part, shape [n], bool; None: all do.
+    The triangles are those near these positions, within the cutoff of the pairs. Normals point about away from the solid, shape
+    [n, d]: with them most pairs on one side are told from others at once.
     """
     x, normal = jax.lax.stop_gradient((x, normal))
     close = tri.count > 0 if there is None else (tri.count > 0) & there

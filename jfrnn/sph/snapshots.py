@@ -65,11 +65,7 @@ def latest(folder: Path, scene: Scene) -> tuple[State, int] | None:
 
 
 def check_same(about: dict[str, Any], folder: Path) -> None:
-    """Remember what the run is, or refuse a folder that holds another one.
-
-    Raises:
-        SceneError: The folder holds a run of something else, or cannot be written.
-    """
+    """Remember what the run is, or refuse a folder that holds another one, or that cannot be written."""
     path = _take(folder) / "run.json"
     text = json.dumps(about | {"units": UNITS, "made_by": origin.tell()}, indent=1, sort_keys=True)
     if not path.exists():

@@ -37,12 +37,7 @@ _PLACES, _SHARES = (_NODES + 1) / 2, _WEIGHTS / 2
 
 
 def begin(scene: FluidScene, x: Array, angle: Array | None = None) -> Beside | None:
-    """Look at the solid of a scene from where its particles are; None where it has no solid.
-
-    Args:
-        scene: The scene.
-        x: Positions [m], shape [n, d].
-        angle: By which the wall has turned [rad].
+    """Look at the solid of a scene from positions x [m], shape [n, d], the wall having turned by an angle [rad]; None without one.
 
     Raises:
         SceneError: The mesh is not closed, or a particle of the fluid is in it.
@@ -87,11 +82,7 @@ def _refuse(scene: FluidScene, inside: np.ndarray) -> None:
 
 
 def check_far(scene: FluidScene, x: Array, seen: Beside | None) -> None:
-    """Refuse a fluid that begins inside the solid, so deep that it sees no face: `begin` knows of those that do.
-
-    Raises:
-        SceneError: Names a particle.
-    """
+    """Refuse a fluid that begins inside the solid, so deep that it sees no face: `begin` knows of those that do."""
     if seen is None or scene.solid is None:
         return
     far, corners = ~np.asarray(seen.mask), np.asarray(scene.solid.vertices, np.float64)[scene.solid.faces]
@@ -115,17 +106,10 @@ def _look_through(seen: Beside, at: Array, room: sight.Sight, neighbors: float) 
 
 
 def hidden(model: Model, s: State, beside: Beside, points: Array) -> tuple[Array, Array]:
-    """Find the particles that cannot be seen from points, because a triangle is between.
+    """Find the particles that cannot be seen from points [m], shape [k, d], because a triangle is between.
 
-    Args:
-        model: What acts.
-        s: The state.
-        beside: The wall as particles see it.
-        points: Where one looks from [m], shape [k, d].
-
-    Returns:
-        Pairs of a point and a particle within the cutoff that the wall parts, shape [e, 2], int32, -1 where there are fewer; and
-        whether there was room for all of them, shape [].
+    Returns pairs of a point and a particle within the cutoff that the wall parts, shape [e, 2], int32, -1 where there are fewer;
+    and whether there was room for all of them, shape [].
     """
     count, (n, dim) = len(points), s.x.shape
     room = math.ceil(_ROOM_AROUND * count * _neighbors(model.spacing, model.cutoff, dim))
@@ -191,15 +175,8 @@ def _across(r: Array, turning: Turning[Array, Array]) -> Array:
 def keep_out(model: Model, s: State, x: Array, v: Array, dt: Array, rests: Array | None) -> State:
     """Return the state after a step, at positions near x that are outside of the wall; see the head of this file.
 
-    A particle that meets the wall loses the velocity toward it, one that stays with it takes its velocity.
-
-    Args:
-        model: What acts.
-        s: The state before the step.
-        x: Where it would end [m], shape [n, d].
-        v: Velocities [m/s], shape [n, d].
-        dt: The step [s].
-        rests: Which particles do not move, shape [n], bool; None: all do.
+    A particle that meets the wall loses the velocity toward it, one that stays with it takes its velocity. Steps would end at x [m]
+    with velocities v [m/s], shape [n, d] each; particles that rest, shape [n], bool, do not move.
     """
     if s.solid is None:
         return s._replace(x=x, v=v)
@@ -242,21 +219,11 @@ def keep_out(model: Model, s: State, x: Array, v: Array, dt: Array, rests: Array
 
 
 def integrate_missing(kernel: Kernel, distance: Array, h: float, dim: int) -> tuple[Array, Array]:
-    """Integrate a kernel behind a plane.
+    """Integrate a kernel behind a plane at distances d [m], shape [n], from 0 on; return A and Γ, shape [n] each.
 
     A(d) = ∫ W over the plane [1/m]: the gradient at the particle of what lies behind is -A n. Γ(d) = ∫_d A, the weight of what
-    lies behind. By Gauss's rule with 8 nodes, exact for Wendland kernels in 3D.
-
-    Args:
-        kernel: W.
-        distance: d [m], shape [n], from 0 on.
-        h: Smoothing length [m].
-        dim: 2 or 3.
-
-    Returns:
-        A and Γ, shape [n] each.
-
-    Source: Kulasegaram, Bonet, Lewis & Profit (2004), doi:10.1007/s00466-003-0524-0, for walls by integrals.
+    lies behind. By Gauss's rule with 8 nodes, exact for Wendland kernels in 3D. Source: Kulasegaram, Bonet, Lewis & Profit (2004),
+    doi:10.1007/s00466-003-0524-0, for walls by integrals.
     """
     support = kernel.support * h
     near = jnp.minimum(distance, 0.999 * support)[:, None]  # beyond, both are below 1e-9, and roots have no slope

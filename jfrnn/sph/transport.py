@@ -25,13 +25,7 @@ def advect(pair: Pair, i: Values, j: Values, gradient: Array) -> Array:
 
 
 def spread(pair: Pair, i: Values, j: Values, unit: Array) -> Array:
-    """Return (1 + 0.2 (W/W(dx))⁴) V_j ∇W [1/m], whose sum points to where particles are dense.
-
-    Args:
-        pair: The pair.
-        i: Values of i.
-        j: Values of j.
-        unit: W at one particle spacing [1/m^d].
+    """Return (1 + 0.2 (W/W(dx))⁴) V_j ∇W [1/m], whose sum points to where particles are dense; `unit` is W(dx) [1/m^d].
 
     Source: Sun et al. (2017), doi:10.1016/j.cma.2016.10.028, eq. 9, after Monaghan (2000), doi:10.1006/jcph.2000.6439.
     """
@@ -47,10 +41,7 @@ def pressure_rate(pair: Pair, i: Values, j: Values, gradient: Array, stiffness: 
 
 
 def pressure_diffusion(pair: Pair, i: Values, j: Values, viscosity: Array) -> Array:
-    """Return 2ν V_j F (p_i - p_j) [Pa/s], ν of EDAC.
-
-    Source: Ramachandran & Puri (2019), doi:10.1016/j.compfluid.2018.11.023.
-    """
+    """Return 2ν V_j F (p_i - p_j) [Pa/s], ν of EDAC. Source: as `pressure_rate`."""
     return 2 * viscosity * j["volume"] * pair.pull * (i["p"] - j["p"])
 
 

@@ -30,16 +30,9 @@ class _Canvas(NamedTuple):
 
 
 def render(scene: Scene, x: np.ndarray, colors: np.ndarray, time: float) -> np.ndarray:
-    """Return a picture of the solid of a scene in 3D and of particles, as balls of their volume.
+    """Return a picture of the solid of a scene in 3D and of particles [m], shape [n, 3], as balls of their volume.
 
-    Args:
-        scene: The scene: its solid, bounds and spacing.
-        x: Positions of particles [m], shape [n, 3].
-        colors: Of particles, shape [n, 3].
-        time: [s].
-
-    Returns:
-        Colors from 0 to 1, shape [h, w, 3], the uppermost row first.
+    Colors are numbers from 0 to 1, shape [n, 3] of particles, and [h, w, 3] of the picture, the uppermost row first.
     """
     canvas = _canvas(scene)
     if scene.solid is not None:

@@ -77,15 +77,8 @@ def source(pair: Pair, i: Values, j: Values, viscosity: Array) -> Array:
 def artificial(pair: Pair, i: Values, j: Values, strength: Array) -> Array:
     """Return the factor of ∇W in Monaghan's artificial viscosity, shape []: of particles that come closer, zero else.
 
-    -m_j Π, Π = -αch φ/ρ̄, φ = v·r/(r² + h²/100) where that is negative.
-
-    Args:
-        pair: The pair.
-        i: Values of i.
-        j: Values of j.
-        strength: αc [m/s].
-
-    Source: Monaghan (1992), doi:10.1146/annurev.aa.30.090192.002551.
+    -m_j Π, Π = -αch φ/ρ̄, φ = v·r/(r² + h²/100) where that is negative; `strength` is αc [m/s]. Source: Monaghan (1992),
+    doi:10.1146/annurev.aa.30.090192.002551.
     """
     approach = jnp.minimum((j["v"] - i["v"]) @ pair.r, 0.0)
     return 2 * strength * pair.h * j["m"] * approach / ((pair.square + 0.01 * pair.h**2) * (i["rho"] + j["rho"]))

@@ -9,19 +9,9 @@ from jfrnn.sph.pairs import Pair, Values
 
 
 def bounce(x: Array, v: Array, lower: Array, upper: Array, restitution: Array) -> tuple[Array, Array]:
-    """Put particles that left the tank onto its wall, and turn and damp the velocity across it.
+    """Put particles that left the tank onto its wall, and turn and damp the velocity across it, of which `restitution` is left.
 
-    Args:
-        x: Positions [m], shape [n, d].
-        v: Velocities [m/s], shape [n, d].
-        lower: Lower corner [m], shape [d].
-        upper: Upper corner [m], shape [d].
-        restitution: Share of the velocity that is left.
-
-    Returns:
-        Positions and velocities.
-
-    Source: ReCoDE-SPH-solver-2D-NS (2024).
+    Positions [m] and velocities [m/s] are [n, d], the corners [d]. Source: ReCoDE-SPH-solver-2D-NS (2024).
     """
     outside = (x < lower) | (x > upper)
     return jnp.clip(x, lower, upper), jnp.where(outside, -restitution * v, v)
@@ -36,14 +26,8 @@ def wall_terms(pair: Pair, i: Values, j: Values) -> dict[str, Array]:
 def extrapolate(sums: dict[str, Array], wall_velocity: Array, gravity: Array | None) -> tuple[Array, Array]:
     """Return the pressures [Pa], shape [n], and velocities [m/s], shape [n, d], that wall particles show to the fluid.
 
-    p = (Σ p_j W + g·Σ ρ_j (x_i - x_j) W)/Σ W; u = 2 v_wall - Σ v_j W/Σ W, so that the fluid is held at the wall.
-
-    Args:
-        sums: Of `wall_terms`.
-        wall_velocity: v_wall [m/s], shape [n, d].
-        gravity: g [m/s²], shape [d], or None.
-
-    Source: Adami, Hu & Adams (2012), doi:10.1016/j.jcp.2012.05.005, eqs. 23 and 27.
+    p = (Σ p_j W + g·Σ ρ_j (x_i - x_j) W)/Σ W; u = 2 v_wall - Σ v_j W/Σ W, so that the fluid is held at the wall. Sums are those of
+    `wall_terms`. Source: Adami, Hu & Adams (2012), doi:10.1016/j.jcp.2012.05.005, eqs. 23 and 27.
     """
     met = sums["weight"] > jnp.finfo(sums["weight"].dtype).smallest_normal ** 0.5  # whose square is a divisor of derivatives
     weight = jnp.where(met, sums["weight"], 1)
