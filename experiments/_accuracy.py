@@ -17,12 +17,8 @@ CHUNK = 1 << 20
 def errors(found: Found, row: dict[str, Any], exact: np.ndarray, positions: np.ndarray, cutoff: float) -> dict[str, float]:
     """Return density_error, gradient_error and jump_error of what a method found, those that can be known.
 
-    Args:
-        found: What the method found; of one that sums itself, the density alone is looked at, in its own arithmetic.
-        row: What `_compare.compare` said of it.
-        exact: Sorted keys i·n + j of the oracle.
-        positions: Shape [n, d].
-        cutoff: Rounded to their dtype.
+    Of a method that sums itself, the density alone is looked at, in its own arithmetic. `row` is what `_compare.compare` said,
+    `exact` the sorted keys i·n + j of the oracle, and the cutoff is rounded to the dtype of the positions [n, d].
     """
     n = len(positions)
     if found.density is not None:
@@ -70,12 +66,7 @@ def sums(
 ) -> np.ndarray:
     """Return of each particle density, its gradient times the cutoff, and the sum of unit vectors, shape [n, 1 + 2 d].
 
-    Args:
-        pairs: Indices (i, j); j is summed at i, and with `both` i at j too.
-        weight: Of each, shape [m]; None: 1.
-        positions: Shape [n, d].
-        cutoff: Where the kernel ends.
-        both: Whether each entry stands for both directions.
+    Of pairs (i, j), weighed one by one or each by 1, j is summed at i, and with `both` i at j too.
     """
     n, dim = positions.shape
     total, x = np.zeros((n, 1 + 2 * dim)), positions.astype(np.float64)

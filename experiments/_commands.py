@@ -108,9 +108,6 @@ def _option_of(error: Any, given: Sequence[str]) -> str | None:  # noqa: ANN401
     return None
 
 
-# --- checks ---------------------------------------------------------------------------------------------------------------
-
-
 def finite(value: Any) -> Any:  # noqa: ANN401
     """Refuse numbers that are none, or infinite: a range lets NaN through."""
     for number in value if isinstance(value, list | tuple) else [value]:
@@ -133,21 +130,13 @@ def _check_engine(value: str) -> str:
 
 
 def check_choice(option: str, value: str, allowed: Sequence[str]) -> None:
-    """Refuse a word that an option does not know.
-
-    Raises:
-        UsageError: Names the option and what is allowed.
-    """
+    """Refuse a word that an option does not know, naming the option and what is allowed."""
     if value not in allowed:
         raise UsageError(f"{option} {value}: allowed: {', '.join(allowed)}")
 
 
 def check_names(kind: str, names: Sequence[str] | None, allowed: Iterable[str]) -> None:
-    """Refuse names of what there is none of.
-
-    Raises:
-        UsageError: Names the first of them, and what is allowed.
-    """
+    """Refuse names of what there is none of, naming the first of them, and what is allowed."""
     allowed = list(allowed)
     if unknown := [name for name in names or () if name not in allowed]:
         raise UsageError(f"no {kind} {unknown[0]!r}; allowed: {', '.join(allowed)}")
@@ -160,11 +149,7 @@ def check_ending(path: Path, allowed: Sequence[str]) -> None:
 
 
 def take_folder(folder: Path, option: str = "--out") -> Path:
-    """Make the folder that takes what a command writes, and return it.
-
-    Raises:
-        UsageError: It cannot be made or written; the message names the option.
-    """
+    """Make the folder that takes what a command writes, and return it; where that cannot be, the message names the option."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         if not os.access(folder, os.W_OK | os.X_OK):

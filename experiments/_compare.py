@@ -13,16 +13,11 @@ SAMPLED = 20_000  # particles
 
 
 def compare(found: Found, exact: np.ndarray, size: int) -> dict[str, Any]:
-    """Return what a row says about the pairs: how many, and how many are missing or extra.
+    """Return what a row says about the pairs against the oracle's sorted keys i·n + j: how many, how many are missing or extra.
 
     All count unordered pairs. In a directed list a pair is found when both directions are there; one direction alone is missing
     where the oracle has the pair and extra where it has not. A pair given twice, or a particle paired with itself, is extra. Of
     counts, only the surplus and the deficit of each particle can be seen: half their sums, rounded up.
-
-    Args:
-        found: What the method found.
-        exact: Sorted keys i·n + j of the oracle.
-        size: Number of particles n.
     """
     if found.pairs is None:
         if found.counts is None:
@@ -41,15 +36,9 @@ def sample(size: int) -> np.ndarray:
 
 
 def compare_sample(found: Found, exact: np.ndarray, rows: np.ndarray, size: int) -> dict[str, Any]:
-    """Return the same of some particles alone: their rows of a list, or their counts.
+    """Return the same of some particles alone, by the keys that the oracle has of them: their rows of a list, or their counts.
 
     A pair counts as half a pair for each of its particles that is among them; halves are rounded up.
-
-    Args:
-        found: What the method found.
-        exact: Sorted keys i·n + j of the oracle, of these particles i and whatever j is.
-        rows: The particles.
-        size: Number of particles n.
     """
     if found.pairs is None:
         assert found.counts is not None

@@ -185,12 +185,9 @@ class Spec:
 
 
 def narrow(config: Config, **asked: Any) -> Config:  # noqa: ANN401
-    """Return a config with other methods, layouts, fills and so on, where they are not None.
+    """Return a config with other methods, layouts, fills and so on, where they are not None; refuse what is not allowed.
 
     Layouts have the fills that the config gives them, their own where it names them nowhere, or those that are asked for.
-
-    Raises:
-        UsageError: What is asked for is not allowed.
     """
     asked = {name: value for name, value in asked.items() if value is not None}
     layouts, fills = asked.pop("layouts", None), asked.pop("fills", None)
@@ -215,11 +212,7 @@ ConfigT = TypeVar("ConfigT", bound=Table)
 
 
 def load(path: Path, kind: type[ConfigT] = Config) -> ConfigT:
-    """Read and check a config, by default that of a sweep.
-
-    Raises:
-        UsageError: The file cannot be read, is no TOML, or says something that is not allowed.
-    """
+    """Read and check a config, by default that of a sweep; each mistake in it is a line of a `UsageError`."""
     try:
         return kind.model_validate(tomllib.loads(path.read_text(encoding="utf-8")))
     except OSError as error:

@@ -15,18 +15,10 @@ DIGITS = {np.dtype(np.float32): 9, np.dtype(np.float64): 17}  # enough to read t
 
 
 def write(scene: "Scene", path: Path, counts: bool = False) -> Path:
-    """Write the points of a scene, and with `counts` the number of neighbors of each, exactly.
+    """Write the points of a scene to a file whose ending names the format, and with `counts` the neighbors of each, exactly.
 
     Coordinates are written such that they read back as the same floats. In .vtp and .vtk, 2D points get z = 0, each point is a
     vertex cell, and spacing and cutoff [m] are field data.
-
-    Args:
-        scene: A scene of `jfrnn.cases`.
-        path: The file; its ending names the format.
-        counts: Whether to store the counts.
-
-    Returns:
-        The path.
     """
     neighbors = None
     if counts:

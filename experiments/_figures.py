@@ -23,19 +23,15 @@ HATCHES = {"CLL": "", "ANN-NL": "///", "ANN": "..."}
 def compare_entries(table: Frame) -> Frame:
     """Return a line for each entry of Table 6.1: layout, fill [%], method, times [s] and memories [MB] of both, parts of the times.
 
-    Args:
-        table: From `_study.table`; ours is NaN where it has no such row.
+    The table is that of `_study.table`; ours is NaN where it has no such row.
     """
     good, lines = table[table.status == "ok"], []
     for (layout, percent, method), figures in _thesis.table().items():
         here = good[(good.layout == layout) & ((100 * good.fill_asked + 1e-9).astype(int) == percent)]
         ours = next((name for name in SHOWN[method] if (here.method == name).any()), None)
         line: dict[str, Any] = {"layout": layout, "fill": percent, "method": method, "ours": ours}
-        line |= {
-            "thesis_s": figures.seconds,
-            "thesis_mb": figures.megabytes,
-            **{f"thesis_{k}": v for k, v in figures.parts.items()},
-        }
+        line |= {"thesis_s": figures.seconds, "thesis_mb": figures.megabytes}
+        line |= {f"thesis_{name}": seconds for name, seconds in figures.parts.items()}
         row = here[here.method == ours].iloc[0] if ours else {}
         line |= {name: row.get(name, np.nan) for name in ("median_s", "low_s", "high_s", "search_mb", *figures.parts)}
         lines.append(line)
@@ -45,15 +41,9 @@ def compare_entries(table: Frame) -> Frame:
 
 
 def bars(lines: Frame, ours: str, theirs: str, label: str, methods: Iterable[str], title: str) -> Figure:
-    """Draw two bars for each method on each scene, ours and the thesis's.
+    """Draw two bars for each method on each scene, of the columns `ours` and `theirs` of lines from `compare_entries`.
 
-    Args:
-        lines: From `compare_entries`, those that are to be shown.
-        ours: Column of our values.
-        theirs: Column of the thesis's.
-        label: Of the values.
-        methods: Of the thesis.
-        title: Of the figure; which method is first, here and in the thesis, is added.
+    To the title is added which method is first, here and in the thesis.
     """
     title = f"{title}. First is {_first(lines, ours, methods)} here, {_first(lines, theirs, methods)} in the thesis"
     methods = [name for name in methods if (lines.method == name).any()]

@@ -28,11 +28,7 @@ def is_layout(name: str) -> bool:
 
 
 def make(name: str, **options: Any) -> "Scene":  # noqa: ANN401 - those of `cases.scene`
-    """Return a scene of `jfrnn.cases`.
-
-    Raises:
-        UsageError: There is no such layout, or it cannot be made with these options.
-    """
+    """Return a scene of `jfrnn.cases`; refuse a layout that there is not, or that cannot be made with these options."""
     import cases
 
     if not is_layout(name):

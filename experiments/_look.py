@@ -127,9 +127,7 @@ _LEADER = {"arrowstyle": "-", "color": "0.75", "lw": 0.6, "shrinkA": 1, "shrinkB
 def write_names(axes: Axes, ends: Sequence[tuple[str, float, float, str]]) -> None:
     """Write names beside the right edge of the axes, each as high as its line ends and none upon another, with a thin line to it.
 
-    Args:
-        axes: What the lines are drawn in; its limits are final.
-        ends: Name, x and y of the last mark, and color of each line.
+    Of each line, `ends` has the name, x and y of the last mark, and the color; the limits of the axes are final.
     """
     if not ends:
         return
@@ -158,10 +156,7 @@ def write_names(axes: Axes, ends: Sequence[tuple[str, float, float, str]]) -> No
 def write_names_near(figure: Figure, axes: Axes, marks: Sequence[tuple[str, float, float, str]]) -> None:
     """Write the name of each mark where neither a mark nor another name is: right, left, above or below, then further off.
 
-    Args:
-        figure: It, with all else that takes room, is complete.
-        axes: What the marks are drawn in; its limits are final.
-        marks: Name, x, y and color of each.
+    Marks are names, x, y and colors. All else that takes room is complete, and the limits of the axes are final.
     """
     figure.draw_without_rendering()
     points = [axes.transData.transform((x, y)) for _, x, y, _ in marks]
@@ -186,11 +181,8 @@ def write_names_near(figure: Figure, axes: Axes, marks: Sequence[tuple[str, floa
 def headline(found: dict[str, dict[str, float]], what: str, scenes: str = "scenes", beside: bool = False) -> str:
     """Say where our list stands among those of others, with factors.
 
-    Args:
-        found: Of each scene the seconds or bytes of each method that the picture shows.
-        what: `fast`, of seconds; `lean`, of bytes.
-        scenes: What the keys of `found` are.
-        beside: Whether most times were measured beside other work, or nobody knows: they tell then which method is first to nobody.
+    Of each scene, `found` has the seconds (`fast`) or bytes (`lean`) of each method that the picture shows. Times measured `beside`
+    other work, or where nobody knows, do not tell which method is first.
     """
     if beside and what == "fast":
         return "Time of a search, measured beside other work or too briefly: who is first is not said"

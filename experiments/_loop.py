@@ -57,18 +57,11 @@ def fill(
     about: dict[str, Any] | None = None,
     begin: Callable[[list[Task[RowT]], Shown], None] = lambda left, shown: None,
 ) -> list[RowT]:
-    """Measure what a file does not hold yet, and return the rows of all tasks.
+    """Measure what a file does not hold yet, in the order of the tasks, and return the rows of all of them.
 
-    Args:
-        file: Gets each row as it comes, with machine, commit and time.
-        tasks: What is measured, in this order.
-        describe: Returns a row as a line for the reader; None: nothing is said.
-        retry_failed: Whether rows that are missing, failed or ran out of time are measured again.
-        about: What else all new rows say, as far as they do not say it themselves.
-        begin: Is told what is left to measure.
-
-    Raises:
-        UsageError: Another process fills this file, or a line of it is no row.
+    The file gets each row as it comes, with machine, commit, time, and what `about` says besides. `describe` makes a line for the
+    reader of a row, or None. With `retry_failed`, rows that are missing, failed or ran out of time are measured again. `begin` is
+    told what is left to measure. Refused where another process fills the file, or a line of it is no row.
     """
     with file.lock():
         file.repair()

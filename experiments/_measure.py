@@ -109,12 +109,8 @@ def repeat(
 ) -> tuple[Any, list[float]]:
     """Run a search again and again; return its last result and the time of each run [s].
 
-    Args:
-        search: The search; each result is dropped before the next run, so that memory holds one.
-        repeats: Fewest runs.
-        min_seconds: Runs go on until they took this long together [s] ...
-        max_repeats: ... or until there are so many.
-        most_seconds: No run begins when they took this long together, be they as few as they may.
+    There are at least `repeats` runs, and more until they took `min_seconds` together or are `max_repeats`; none begins after
+    `most_seconds`. Each result is dropped before the next run, so that memory holds one.
     """
     seconds: list[float] = []
     while True:
@@ -157,17 +153,11 @@ def compile_scan(
 
 
 def time_in_turns(calls: dict[str, Callable[[], Any]], rounds: int, burst: int = 1) -> tuple[dict[str, list[float]], float | None]:
-    """Time calls in turns, so that all suffer alike from what else the machine does.
+    """Time compiled and warm calls in turns, so that all suffer alike from what else the machine does.
 
-    Each run follows one call that is not timed: it is its own data that the caches hold, not what another call left there.
-
-    Args:
-        calls: By name; compiled, and warm.
-        rounds: Timed runs of each.
-        burst: Calls per run, of which the last is waited for: what a device takes, where the host need not wait for each.
-
-    Returns:
-        The times of each [s], and how many cores others kept busy meanwhile.
+    Each run follows one call that is not timed: it is its own data that the caches hold, not what another call left there. It is a
+    burst of calls, of which the last is waited for: what a device takes, where the host need not wait for each. Return the times
+    of each [s], and how many cores others kept busy meanwhile.
     """
     import jax
 

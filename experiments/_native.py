@@ -18,14 +18,8 @@ PAIRS = (("pairs_size", ctypes.c_int64), ("pairs_data", ctypes.c_void_p), ("pair
 def load(name: str, header: str, package: str, libraries: tuple[str, ...] = ()) -> ctypes.CDLL:
     """Return the compiled adapter `native/NAME.cpp`; compiled anew only where its text or the compiler has changed.
 
-    Args:
-        name: Of the source, without its ending.
-        header: That the source includes, such as ANN/ANN.h.
-        package: Of Debian that has it, named in errors.
-        libraries: To link.
-
-    Raises:
-        ImportError: There is no compiler, or the library is not installed; it says how to get it.
+    It includes a header, such as ANN/ANN.h, which a package of Debian has, and is linked to libraries. An ImportError says how to
+    get the compiler or the library where there is none.
     """
     compiler = shutil.which(os.environ.get("CXX", "g++"))
     if compiler is None:

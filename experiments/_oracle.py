@@ -29,17 +29,9 @@ def round_cutoff(cutoff: float, dtype: DTypeLike) -> float:
 
 
 def find_pairs(positions: np.ndarray, cutoff: float) -> np.ndarray:
-    """Return all pairs i < j with distance < cutoff as sorted keys i·n + j.
+    """Return all pairs i < j with distance < cutoff as sorted keys i·n + j, int64; the cutoff is rounded to the dtype first.
 
-    Args:
-        positions: Finite coordinates, shape [n, d], float32 or float64.
-        cutoff: Interaction radius; rounded to the dtype of the positions first.
-
-    Returns:
-        int64 keys, shape [m], strictly increasing.
-
-    Raises:
-        ValueError: The cutoff is so small or so large that float64 cannot square it.
+    Positions are finite, shape [n, d], float32 or float64. A ValueError says where float64 cannot square the cutoff.
     """
     cutoff = round_cutoff(cutoff, positions.dtype)
     if not SQUARABLE[0] < cutoff < SQUARABLE[1]:
@@ -88,10 +80,7 @@ def count_neighbors(keys: np.ndarray, size: int) -> np.ndarray:
 def find_sample(positions: np.ndarray, cutoff: float, rows: np.ndarray) -> np.ndarray:
     """Return all pairs of some particles i, whatever j is, as sorted keys i·n + j: where those of all would not fit into memory.
 
-    Args:
-        positions: Finite coordinates, shape [n, d], float32 or float64.
-        cutoff: Interaction radius; rounded to the dtype of the positions first.
-        rows: The particles, ascending, shape [s].
+    As in `find_pairs`; the particles are given in ascending order, shape [s].
     """
     cutoff, points = round_cutoff(cutoff, positions.dtype), positions.astype(np.float64)
     tree = KDTree(points, compact_nodes=False, balanced_tree=False)  # few are asked: what takes long is to build it

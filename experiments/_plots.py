@@ -43,13 +43,7 @@ MEMORY = Quantity(_memory, "peak memory of a search [MB]", attrgetter("megabytes
 
 
 def draw_all(rows: Sequence[SearchRow], folder: Path, origin: str) -> list[Path]:
-    """Draw every picture into the folder and return their paths; none where no row has figures.
-
-    Args:
-        rows: Rows of a sweep.
-        folder: Where the pictures go.
-        origin: Machine, versions and date, written below each picture.
-    """
+    """Draw every picture into the folder, with its origin below, and return their paths; none where no row has figures."""
     good = _table.in_order([row for row in rows if row.status == "ok"])
     wanted: tuple[tuple[str, Value, Callable[[], Figure]], ...] = (
         ("runtime_by_layout", TIME.value, partial(by_layout, good, TIME)),

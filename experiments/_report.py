@@ -46,11 +46,7 @@ def report(folder: Path) -> None:
 
 
 def report_sweep(folder: Path) -> None:
-    """Print the table of a sweep and the paths of its files: table.csv and the pictures, beside the rows.
-
-    Raises:
-        UsageError: The folder holds no rows.
-    """
+    """Print the table of a sweep, which has to hold rows, and the paths of its files: table.csv and the pictures, beside them."""
     rows = read_latest(folder)
     if not rows:
         raise UsageError(f"{folder}: no rows; fill it with `python -m experiments run CONFIG.toml --out {folder}`")

@@ -136,19 +136,14 @@ class RowFile(Generic[RowT]):
 
     @contextmanager
     def lock(self) -> Iterator[None]:
-        """Keep other runners off the folder; the system lets go of it when this process ends, however it does.
-
-        Raises:
-            UsageError: Another process runs this sweep now.
-        """
+        """Keep other runners off the folder; the system lets go of it when this process ends, however it does."""
         self.path.parent.mkdir(parents=True, exist_ok=True)
         with (self.path.parent / "lock").open("w") as lock:
             try:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
-                raise UsageError(
-                    f"{self.path.parent}: another process fills this folder now; wait for it or take another"
-                ) from None
+                folder = self.path.parent
+                raise UsageError(f"{folder}: another process fills this folder now; wait for it or take another") from None
             yield
 
     def repair(self) -> None:
@@ -177,20 +172,12 @@ class RowFile(Generic[RowT]):
             os.fsync(stream.fileno())
 
     def read(self) -> list[RowT]:
-        """Return the latest row of each key, in the order of their first appearance; half a last line is passed over.
-
-        Raises:
-            UsageError: A line is no row.
-        """
+        """Return the latest row of each key, in the order of their first appearance; half a last line is passed over."""
         rows = self.read_all()
         return list({_key(row, number): row for number, row in enumerate(rows)}.values())
 
     def read_all(self) -> list[RowT]:
-        """Return the rows as they stand in the file, also those that others with their key have replaced.
-
-        Raises:
-            UsageError: A line is no row.
-        """
+        """Return the rows as they stand in the file, also those that others with their key have replaced; refuse what is no row."""
         kind: Any = self._kind
         known = None if kind is dict else {item.name for item in fields(kind)}
         rows: list[Any] = []
@@ -223,8 +210,5 @@ def read_latest(folder: Path) -> list[SearchRow]:
     """Return the rows of a sweep that count: of one method on one scene in one round, the last in the file.
 
     A config that changes how it measures, by how many repeats say, gives its rows other keys, and those from before stay.
-
-    Raises:
-        UsageError: A line is no row.
     """
     return list({(*row.scene_key, row.method, row.process): row for row in RowFile(folder).read_all()}.values())

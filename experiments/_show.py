@@ -28,15 +28,7 @@ def endings() -> list[str]:
 
 
 def draw(scene: "Scene", path: Path) -> Path:
-    """Draw a scene from above, or in 3D with a slice through its fullest layer; lengths in mm.
-
-    Args:
-        scene: A scene of `jfrnn.cases`, in 2 or 3 dimensions.
-        path: The picture; its ending names the format.
-
-    Returns:
-        The path.
-    """
+    """Draw a scene from above, or in 3D with a slice through its fullest layer, lengths in mm, and return the path."""
     points = scene.positions.astype(np.float64) * MILLI
     flat = scene.dim == 2
     figure = Figure(figsize=(6.0, 7.5) if flat else (11.5, 7.0), layout=ConstrainedLayoutEngine(wspace=0.0 if flat else 0.12))

@@ -26,14 +26,10 @@ class Interval(NamedTuple):
 
 
 def median_interval(values: Sequence[float], confidence: float = CONFIDENCE) -> Interval:
-    """Return the median and its interval between two order statistics: no assumption on the distribution.
+    """Return the median of measurements and its interval between two order statistics: no assumption on the distribution.
 
     The number of values below the median is binomial. Five values reach 93.75 % from the least to the largest, six 96.9 %.
     Source: Conover, Practical Nonparametric Statistics (1999), section 3.2.
-
-    Args:
-        values: Independent measurements, at least one.
-        confidence: Probability that the interval holds the median.
     """
     ordered = np.sort(np.asarray(values, float))
     n = len(ordered)

@@ -17,15 +17,10 @@ Frame = Any  # a pd.DataFrame; what its columns hold, its annotations do not kno
 
 
 def rows(sweep: str) -> list[SearchRow]:
-    """Return the committed rows of a sweep, by the name of its folder below experiments/results.
-
-    Raises:
-        UsageError: There are none.
-    """
-    if not (found := read_latest(RESULTS / sweep)):
-        raise UsageError(
-            f"{RESULTS / sweep}: no rows; fill it with `python -m experiments run CONFIG.toml --out {RESULTS / sweep}`"
-        )
+    """Return the committed rows of a sweep, by the name of its folder below experiments/results."""
+    folder = RESULTS / sweep
+    if not (found := read_latest(folder)):
+        raise UsageError(f"{folder}: no rows; fill it with `python -m experiments run CONFIG.toml --out {folder}`")
     return found
 
 
@@ -66,14 +61,8 @@ def effect(lines: Frame, factor: str, before: object, after: object, value: str 
     """Return value(after) / value(before) of scenes and methods that differ in one factor alone, None where there are none.
 
     The unit is the round: a geometric mean over its scenes, so that processes of one round, which share what the machine did then,
-    count once; what machines of different kinds measured is not compared. Intervals and p: Student's t on the logarithms.
-
-    Args:
-        lines: From `rounds`.
-        factor: Column that differs; all other columns that describe the scene are the same.
-        before: Its value below the fraction bar.
-        after: Its value above.
-        value: Column that is compared.
+    count once; what machines of different kinds measured is not compared. Intervals and p: Student's t on the logarithms. Lines are
+    those of `rounds`; all columns that describe the scene but the factor are the same.
     """
     chosen = lines[lines[factor].isin([before, after])]
     if chosen.empty:

@@ -28,12 +28,9 @@ REASON_LENGTH = 600
 def run(config: Config, name: str, folder: Path, retry_failed: bool = False, shard: tuple[int, int] = (1, 1)) -> list[SearchRow]:
     """Measure every row of the config that the folder does not hold yet, and return all rows of the config.
 
-    Args:
-        config: The sweep.
-        name: Name of the config, kept in the rows.
-        folder: Holds rows.jsonl, and until all rows are there the exact pairs.
-        retry_failed: Whether rows that are missing, failed or ran out of time are measured again.
-        shard: (k, n): only every n-th scene from the k-th on, with all its methods and processes, which are to be compared.
+    The folder holds rows.jsonl, and until all rows are there the exact pairs. With `retry_failed`, rows that are missing, failed or
+    ran out of time are measured again. Of a shard (k, n), rows are those of every n-th scene from the k-th on, with all its
+    methods and processes, which are to be compared.
     """
     sweep, specs = _Sweep(folder), shard_specs(config.specs(), shard)
     sweep.tasks = {
@@ -105,14 +102,9 @@ def _prepare_oracle(spec: Spec, folder: Path, shown: Shown) -> None:
 
 
 def measure(spec: Spec, folder: Path, known: dict[str, Any] | None = None) -> SearchRow:
-    """Measure one row in a fresh process; never raises for what happens there.
+    """Measure one row in a fresh process, or as is `known` without it; never raises for what happens there.
 
     The first process of a row compiles its kernels, which is timed; the others take them from the folder.
-
-    Args:
-        spec: The row.
-        folder: Holds the exact pairs, and kernels.
-        known: What the process would answer, where that is known without it.
     """
     kernels = None if spec.process == 0 else folder.resolve() / "kernels"
     answer = known or ask(_task("measure", spec, folder), spec.timeout, kernels=kernels)
@@ -126,13 +118,10 @@ def _task(do: str, spec: Spec, folder: Path) -> dict[str, Any]:
 
 
 def ask(task: dict[str, Any], timeout: float, *, cold: bool = True, kernels: Path | None = None) -> dict[str, Any]:
-    """Let a worker do a task and return its answer, or a status with the reason why there is none.
+    """Let a worker do a task and return its answer, or a status with the reason why there is none, after the timeout [s] at last.
 
-    Args:
-        task: See `experiments._worker`.
-        timeout: The worker is ended after this time [s].
-        cold: Kernels are compiled anew: a compile time from a warm cache would mean nothing.
-        kernels: Take kernels from this folder, and leave them there, instead.
+    `cold`: kernels are compiled anew, as a compile time from a warm cache would mean nothing; or they are taken from a folder, and
+    left there.
     """
     with tempfile.TemporaryDirectory() as cache:
         where = {"WARP_CACHE_PATH": str(kernels or cache), "JAX_ENABLE_COMPILATION_CACHE": "false"}
@@ -157,12 +146,9 @@ def _explain_exit(code: int, stderr: str) -> str:
 
 
 def merge(folder: Path, parts: Iterable[Path]) -> int:
-    """Add to a folder the rows of others that it does not hold, and return how many came.
+    """Add to a folder the rows of others that it does not hold, and return how many came; refuse parts without rows.
 
     Among rows of one key, a row that is ok counts, and among those the one with more repeats.
-
-    Raises:
-        UsageError: There are no parts, a part has no rows, or a line of it is no row.
     """
     file, came, parts = RowFile(folder), 0, list(parts)
     if not parts:

@@ -58,12 +58,7 @@ def counterparts(present: Iterable[str]) -> dict[str, str]:
 
 
 def figures(row: SearchRow, method: str | None = None) -> Figures | None:
-    """Return what the thesis says about the scene of a row, None where it says nothing.
-
-    Args:
-        row: A row of a sweep.
-        method: Method of the thesis; without it, the counterpart of the row's method.
-    """
+    """Return what the thesis says of the scene of a row, by a method of its own or the counterpart; None where it says nothing."""
     wanted = method or COUNTERPARTS.get(row.method)
     same_lattice = math.isclose(row.spacing, SPACING) and math.isclose(row.cutoff_ratio, CUTOFF_RATIO) and row.dim == DIM
     same_lattice = same_lattice and row.order == ORDER

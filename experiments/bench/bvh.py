@@ -34,15 +34,7 @@ class Tree:
     """A mesh on a device, and points that ask for it."""
 
     def __init__(self, points: np.ndarray, vertices: np.ndarray, faces: np.ndarray, cutoff: float, device: str) -> None:
-        """Build the tree.
-
-        Args:
-            points: Shape [n, 3], float32.
-            vertices: Shape [v, 3], float32.
-            faces: Shape [f, 3].
-            cutoff: Beyond, distances are infinite.
-            device: "cpu", or such as "cuda:0".
-        """
+        """Build the tree of vertices [v, 3] and faces [f, 3] for points [n, 3], float32, on "cpu" or such as "cuda:0"."""
         corners = wp.array(vertices, dtype=wp.vec3, device=device)
         self._mesh = wp.Mesh(corners, wp.array(faces.reshape(-1).astype(np.int32), dtype=wp.int32, device=device))
         given, n = [self._mesh.id, wp.array(points, dtype=wp.vec3, device=device), cutoff], len(points)

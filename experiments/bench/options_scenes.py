@@ -1,8 +1,8 @@
 """What `bench options` times: a plain search, the same with one option at a time, and what each of them is compared with."""
 
-import functools
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -54,26 +54,25 @@ def beside(option: Option, asked: Asked, pairs: int) -> Asked:
     """Return the question that an option is compared with, which has so many pairs itself."""
     if option.beside == AS_MANY:
         return Asked(asked.x, _radius_of(asked, pairs), {})
-    return {FIRST: _plain, LARGEST: _plain, WITHOUT_FAR: _smooth(_uniform), MOVED: _lattice(moved=True)}[option.beside](
-        len(asked.x)
-    )
+    makers = {WITHOUT_FAR: partial(_smooth, _uniform), MOVED: partial(_lattice, 1.0, moved=True)}
+    return makers.get(option.beside, _plain)(len(asked.x))
 
 
 def options() -> list[Option]:
     """Return all options, the plain search first."""
-    rest = [Option(name, functools.partial(_with, name)) for name in _KINDS]
+    rest = [Option(name, partial(_with, name)) for name in _KINDS]
     rest.append(Option("ten far away", lambda n: _plain(n)._replace(x=jnp.asarray(_far(n)))))
-    rest.append(Option("sum, the largest term", functools.partial(_sum_alone, _largest)))
-    rest.append(Option("sum, a table indexed by species", functools.partial(_sum_alone, _by_species)))
+    rest.append(Option("sum, the largest term", partial(_sum_alone, _largest)))
+    rest.append(Option("sum, a table indexed by species", partial(_sum_alone, _by_species)))
     rest.append(Option("a cutoff per particle, equal", _equal, AS_MANY))
-    rest += [Option(f"a cutoff per particle within a factor of 2, {rule}", _two(rule), AS_MANY) for rule in _RULES]
+    rest += [Option(f"a cutoff per particle within a factor of 2, {rule}", partial(_two, rule), AS_MANY) for rule in _RULES]
     rest.append(Option("a cutoff per pair of two species", _species, LARGEST))
-    rest += [Option(f"cutoffs over a factor of {factor}, uniform points", _spread(factor), AS_MANY) for factor in FACTORS]
+    rest += [Option(f"cutoffs over a factor of {factor}, uniform points", partial(_spread, factor), AS_MANY) for factor in FACTORS]
     shapes = {"uniform": _uniform, "a surface": _surface, "a line": _line, "a Plummer sphere": _plummer}
-    rest += [Option(f"{SMOOTH} neighbors each, {name}", _smooth(points), AS_MANY) for name, points in shapes.items()]
-    rest.append(Option(f"{SMOOTH} neighbors each, uniform, ten far away", _smooth(_far), WITHOUT_FAR))
-    rest += [Option(f"two cutoffs, ties, spacing {spacing:g}", _lattice(spacing), MOVED) for spacing in (1.0, 1e-4)]
-    rest += [Option(f"a cutoff per particle over a factor of 100, {rule}", _graded(rule)) for rule in ("gather", "either")]
+    rest += [Option(f"{SMOOTH} neighbors each, {name}", partial(_smooth, points), AS_MANY) for name, points in shapes.items()]
+    rest.append(Option(f"{SMOOTH} neighbors each, uniform, ten far away", partial(_smooth, _far), WITHOUT_FAR))
+    rest += [Option(f"two cutoffs, ties, spacing {spacing:g}", partial(_lattice, spacing), MOVED) for spacing in (1.0, 1e-4)]
+    rest += [Option(f"a cutoff per particle over a factor of 100, {rule}", partial(_graded, rule)) for rule in ("gather", "either")]
     return [Option(_OPEN, _plain), *rest]
 
 
@@ -151,8 +150,8 @@ def _equal(n: int) -> Asked:
     return _own(_uniform(n), np.full(n, _radius(n)))
 
 
-def _two(rule: str) -> Callable[[int], Asked]:
-    return lambda n: _own(_uniform(n), _radius(n) * np.random.default_rng(1).uniform(2 / 3, 4 / 3, n), rule)
+def _two(rule: str, n: int) -> Asked:
+    return _own(_uniform(n), _radius(n) * np.random.default_rng(1).uniform(2 / 3, 4 / 3, n), rule)
 
 
 def _species(n: int) -> Asked:
@@ -161,25 +160,17 @@ def _species(n: int) -> Asked:
     return Asked(jnp.asarray(_uniform(n)), cutoffs, {"species": jnp.asarray(kinds, jnp.int32)})
 
 
-def _spread(factor: int) -> Callable[[int], Asked]:
-    """Return what makes uniform points with cutoffs over a factor, their logarithms uniform, with as many pairs whatever it is."""
-
-    def make(n: int) -> Asked:
-        logs = np.linspace(0, math.log(factor), n)  # evenly spaced, so that the factor is exactly this one
-        cutoffs = np.random.default_rng(1).permutation(np.exp(logs))
-        return _own(_uniform(n), _radius(n) * cutoffs / np.mean(cutoffs**3) ** (1 / 3))
-
-    return make
+def _spread(factor: int, n: int) -> Asked:
+    """Return uniform points with cutoffs over a factor, their logarithms uniform, with as many pairs whatever it is."""
+    logs = np.linspace(0, math.log(factor), n)  # evenly spaced, so that the factor is exactly this one
+    cutoffs = np.random.default_rng(1).permutation(np.exp(logs))
+    return _own(_uniform(n), _radius(n) * cutoffs / np.mean(cutoffs**3) ** (1 / 3))
 
 
-def _graded(rule: str) -> Callable[[int], Asked]:
-    """Return what makes points whose density goes with distance^-3 over a factor of 100, and cutoffs with about 30 neighbors."""
-
-    def make(n: int) -> Asked:
-        distance = 10.0 ** np.random.default_rng(1).uniform(-2, 0, n)
-        return _own(distance[:, None] * _surface(n), (3 * NEIGHBORS * math.log(100) / n) ** (1 / 3) * distance, rule)
-
-    return make
+def _graded(rule: str, n: int) -> Asked:
+    """Return points whose density goes with distance^-3 over a factor of 100, and cutoffs with about 30 neighbors."""
+    distance = 10.0 ** np.random.default_rng(1).uniform(-2, 0, n)
+    return _own(distance[:, None] * _surface(n), (3 * NEIGHBORS * math.log(100) / n) ** (1 / 3) * distance, rule)
 
 
 def _surface(n: int) -> np.ndarray:
@@ -203,27 +194,19 @@ def _far(n: int) -> np.ndarray:
     return x
 
 
-def _smooth(points: Callable[[int], np.ndarray]) -> Callable[[int], Asked]:
-    """Return what makes points and smoothing lengths, each in the middle between its 57th and 58th neighbor."""
-
-    def make(n: int) -> Asked:
-        x = points(n).astype(np.float32)
-        near = KDTree(x).query(x, SMOOTH + 2, workers=_machine.machine()["cores"])[0]
-        return _own(x, near[:, SMOOTH:].mean(axis=1))
-
-    return make
+def _smooth(points: Callable[[int], np.ndarray], n: int) -> Asked:
+    """Return points and smoothing lengths, each in the middle between its 57th and 58th neighbor."""
+    x = points(n).astype(np.float32)
+    near = KDTree(x).query(x, SMOOTH + 2, workers=_machine.machine()["cores"])[0]
+    return _own(x, near[:, SMOOTH:].mean(axis=1))
 
 
-def _lattice(spacing: float = 1.0, *, moved: bool = False) -> Callable[[int], Asked]:
-    """Return what makes about n sites of a cube in random order and cutoffs of 2 or 3 spacings, at which 6 or 30 sites are."""
-
-    def make(n: int) -> Asked:
-        random, side = np.random.default_rng(1), round(n ** (1 / 3))
-        sites = random.permutation(np.stack(np.meshgrid(*[np.arange(side)] * 3, indexing="ij"), axis=-1).reshape(-1, 3))
-        cutoffs = random.integers(2, 4, len(sites)) * spacing
-        return _own((sites + (random.uniform(-0.3, 0.3, sites.shape) if moved else 0)) * spacing, cutoffs)
-
-    return make
+def _lattice(spacing: float, n: int, moved: bool = False) -> Asked:
+    """Return about n sites of a cube in random order and cutoffs of 2 or 3 spacings, at which 6 or 30 sites are."""
+    random, side = np.random.default_rng(1), round(n ** (1 / 3))
+    sites = random.permutation(np.stack(np.meshgrid(*[np.arange(side)] * 3, indexing="ij"), axis=-1).reshape(-1, 3))
+    cutoffs = random.integers(2, 4, len(sites)) * spacing
+    return _own((sites + (random.uniform(-0.3, 0.3, sites.shape) if moved else 0)) * spacing, cutoffs)
 
 
 def _radius_of(asked: Asked, pairs: int) -> float:

@@ -84,15 +84,9 @@ def measure_process(what: str, packages: Path, kernels: Path) -> table.Line:
 
 
 def run(asked: str, packages: Path, kernels: Path, more: dict[str, str] | None = None) -> table.Line:
-    """Run `fresh` in a process that takes the library from one folder and keeps kernels in another, and return what it says.
+    """Run `fresh` in a process that takes the library from a folder of `link` and keeps kernels in another; return what it says.
 
     Where the library takes a slower engine than it would choose, it warns, and the process fails.
-
-    Args:
-        asked: Its argument.
-        packages: A folder that `link` made.
-        kernels: Where Warp keeps what it compiles.
-        more: Variables of the environment.
     """
     not_given = ("XLA_PYTHON_CLIENT_PREALLOCATE", "JAX_COMPILATION_CACHE_DIR")
     environment = {name: value for name, value in os.environ.items() if name not in not_given}

@@ -66,11 +66,8 @@ class Ready(NamedTuple):
 def judge(row: Line, way: Way, scene: Any, compiled: Callable[[Any], Callable[[], Any]]) -> Ready | None:  # noqa: ANN401
     """Make a way ready; where it cannot be had or its answer is wrong, return None, and the row says why.
 
-    Args:
-        row: Also says who does what, and for how many particles the answer is wrong.
-        way: What is asked.
-        scene: Particles, at `scene.x`.
-        compiled: Returns a call of what the way makes.
+    The row also says who does what, and for how many particles, at `scene.x`, the answer is wrong. `compiled` returns a call of
+    what the way makes.
     """
 
     def answer() -> tuple[Ready, int]:
@@ -100,15 +97,11 @@ def fill_parts(
     describe: Callable[[Line], str | None] = lambda row: None,
     retry_failed: bool = False,
 ) -> list[Line]:
-    """Measure what the folder does not hold yet, and return the rows of all parts.
+    """Measure what the folder does not hold yet, and return the rows of all parts, each of which has a name and makes rows.
 
-    Args:
-        folder: Takes rows.jsonl.
-        parts: What is measured, by name: each makes rows.
-        given: What else decides what is measured: with another value, all is measured.
-        about: What else rows say of where they were measured.
-        describe: Returns a row as a line for the reader, or None.
-        retry_failed: Whether parts whose last row is of something missing or failed are measured again.
+    What is `given` decides what is measured, too: with another value, all is. `about` is what else rows say of where they were
+    measured, and `describe` makes a line of a row for the reader. With `retry_failed`, parts whose last row is of something missing
+    or failed are measured again.
     """
     import jax
 
@@ -123,12 +116,7 @@ def fill_parts(
 def measure(folder: Path, name: str, parts: Iterable[Part], given: object, columns: Sequence[str]) -> pd.DataFrame:
     """Measure what the folder does not hold yet, write the whole table as NAME.csv beside rows.jsonl, and return it.
 
-    Args:
-        folder: Takes the files.
-        name: Of the table, such as cpu_warp.
-        parts: As of `fill_parts`.
-        given: Likewise.
-        columns: Of the table; what a row lacks is left empty.
+    Parts and what is given are as in `fill_parts`; what a row lacks of the columns is left empty.
     """
     import jax
 

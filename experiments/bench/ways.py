@@ -295,11 +295,7 @@ WAYS = {
 
 
 def check_way(name: str) -> str:
-    """Return the name of a way.
-
-    Raises:
-        ValueError: There is none of that name.
-    """
+    """Return the name of a way; a ValueError says which there are."""
     if name not in WAYS:
         raise ValueError(f"unknown way {name!r}; allowed: {', '.join(WAYS)}")
     return name

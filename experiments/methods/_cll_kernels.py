@@ -94,13 +94,7 @@ def append_pairs_kernel(
 
 
 def size_grid(lower: list[float], upper: list[float], cutoff: float, epsilon: float) -> tuple[float, list[int]]:
-    """Return the cell edge and the number of cells per axis.
-
-    Args:
-        lower: Smallest coordinate of any particle per axis, length 3.
-        upper: Largest coordinate of any particle per axis, length 3.
-        cutoff: Interaction radius, in the unit of the coordinates.
-        epsilon: Machine epsilon of the coordinates.
+    """Return the cell edge and the number of cells per axis, for coordinates between two corners and with such an epsilon.
 
     Raises:
         ValueError: The box needs more than `MAX_CELLS` cells.
@@ -117,22 +111,11 @@ def size_grid(lower: list[float], upper: list[float], cutoff: float, epsilon: fl
 
 
 def search_pairs(positions: wp.array, lower: list[float], upper: list[float], cutoff: float) -> wp.array:
-    """Return each unordered pair with distance < cutoff once, decided in the precision of the positions.
+    """Return each unordered pair with distance < cutoff once, shape [m], vec2i, decided in the precision of the positions.
 
-    The structure is built, the pairs are counted, then written: two passes, so the list has exactly the size it needs.
-
-    Args:
-        positions: Particle positions on the CPU, shape [n], dtype vec3f or vec3d.
-        lower: Smallest coordinate per axis, length 3.
-        upper: Largest coordinate per axis, length 3.
-        cutoff: Interaction radius, in the unit of the positions.
-
-    Returns:
-        The pairs, shape [m], dtype vec2i, in the order in which they were met.
-
-    Raises:
-        ValueError: The box needs more than `MAX_CELLS` cells.
-        OverflowError: There are more pairs than an int32 can number.
+    The structure is built, the pairs are counted, then written: two passes, so the list has exactly the size it needs. Positions
+    are on the CPU, shape [n], vec3f or vec3d, between a lower and an upper corner. Refused are a box of more than `MAX_CELLS`
+    cells, and more pairs than an int32 can number.
     """
     vector = positions.dtype
     scalar = vector._wp_scalar_type_

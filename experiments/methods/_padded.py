@@ -49,11 +49,7 @@ def plan_backend(positions: np.ndarray, cutoff: float, capacity: int | None = No
 
 
 def found_in_rows(idx: np.ndarray, count: np.ndarray, device: str) -> Found:
-    """Return the ordered pairs of a padded list; of a large one those that are compared.
-
-    Raises:
-        RuntimeError: A row was cut off.
-    """
+    """Return the ordered pairs of a padded list, of which no row may be cut off; of a large one those that are compared."""
     n, slots = idx.shape
     if count.max(initial=0) > slots:
         raise RuntimeError(f"a row has {count.max()} neighbors and {slots} slots")

@@ -30,14 +30,10 @@ for program, picture in zip(given[::2], given[1::2], strict=True):
 
 
 def run(page: Path, folder: Path) -> list[str]:
-    """Run the programs whose pictures a page shows, and return the names of those that were run.
+    """Run the programs whose pictures a page shows, and return the names of those that were run; a RuntimeError: one failed.
 
-    Args:
-        page: Markdown that names each picture, `pictures/gallery/NAME.png` or `.gif`, of a program NAME.
-        folder: Where the pictures go, and beside each, as `.txt`, what its program printed.
-
-    Raises:
-        RuntimeError: A program failed.
+    The page names each picture, `pictures/gallery/NAME.png` or `.gif`, of a program NAME. Pictures go into the folder, and beside
+    each, as `.txt`, what its program printed.
     """
     pictures = {name: folder / file for file, name in _PICTURE.findall(page.read_text(encoding="utf-8"))}
     folder.mkdir(parents=True, exist_ok=True)

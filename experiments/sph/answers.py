@@ -13,9 +13,7 @@ DRAG = np.pi**2 * 100.0  # of the slowest mode of a channel [1/s]: ν π²/H² w
 def poiseuille(y: np.ndarray, time: float, top_speed: float = 1.25, drag: float = DRAG) -> np.ndarray:
     """Return the velocity [m/s] between plates at rest, y in [0, 1] of their distance H, after a force of 8ν top_speed/H² began.
 
-    `drag` is νπ²/H² [1/s].
-
-    Source: Morris, Fox & Zhu (1997), doi:10.1006/jcph.1997.5776, eq. 31.
+    `drag` is νπ²/H² [1/s]. Source: Morris, Fox & Zhu (1997), doi:10.1006/jcph.1997.5776, eq. 31.
     """
     k = np.arange(1, 200, 2)
     modes = np.sin(np.pi * k * y[:, None]) * np.exp(-drag * k**2 * time) / k**3
@@ -51,12 +49,8 @@ def vortices(times: np.ndarray, reynolds: float, n: int = 48) -> tuple[np.ndarra
     What they decay to has no closed form. A Fourier series of a cube, whose products are made on a grid; the upper third of its
     numbers is left out, so that products are exact (Orszag 1971). Viscosity is an exponential factor, the rest is integrated by
     Runge-Kutta of fourth order. The speed at first and the number of its waves, k, are 1, as in Brachet et al. (1983),
-    doi:10.1017/S0022112083001159: times are in 1/(kU).
-
-    Args:
-        times: Rising, from 0 on, multiples of `VORTEX_STEP` [1/(kU)], shape [k].
-        reynolds: U/(kν).
-        n: Points of the grid along an axis. 48 have a dissipation at Re 100 within 6e-4 of that of 64.
+    doi:10.1017/S0022112083001159: times are in 1/(kU), rising, from 0 on, multiples of `VORTEX_STEP`, and `reynolds` is U/(kν). 48
+    points of the grid along an axis have a dissipation at Re 100 within 6e-4 of that of 64.
     """
     waves = np.stack(np.meshgrid(*[np.fft.fftfreq(n, 1 / n)] * 2, np.fft.rfftfreq(n, 1 / n), indexing="ij"))
     square = np.sum(waves**2, axis=0)
@@ -107,13 +101,9 @@ def table(name: str) -> np.ndarray:
 
 
 def interpolate(x: np.ndarray, values: np.ndarray, points: np.ndarray, reach: float) -> np.ndarray:
-    """Return values at points, from planes fitted to the particles within reach, weighed by a Wendland kernel.
+    """Return values [n], at positions [m], shape [n, 2], at points, shape [k, 2]: from planes fitted to the particles within reach.
 
-    Args:
-        x: Positions [m], shape [n, 2].
-        values: At them, shape [n].
-        points: Where they are asked for [m], shape [k, 2].
-        reach: [m].
+    Particles are weighed by a Wendland kernel.
     """
     found = []
     for point in points:
@@ -149,10 +139,8 @@ def sedov(time: float, energy: float = 1.0, heat_ratio: float = 1.4, dim: int = 
 
     Source: Sedov (1959), Similarity and Dimensional Methods in Mechanics, ch. 4, in the form of Kamm & Timmes (2007),
     LA-UR-07-2849, for a uniform density. Their parameter V runs such that radii are nearly equidistant; the energy behind a front
-    at 1, which sets the scale, is a sum of trapezia.
-
-    Raises:
-        ValueError: The ratio of heats is not between 1 and 2: there the solution has another form.
+    at 1, which sets the scale, is a sum of trapezia. For a ratio of heats that is not between 1 and 2 the solution has another
+    form.
     """
     if not 1 < heat_ratio < 2:
         raise ValueError(f"heat_ratio must be above 1 and below 2, got {heat_ratio}.")

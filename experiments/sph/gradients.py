@@ -78,14 +78,9 @@ def draw(problem: Problem, found: Found) -> Figure:
 
 
 def memory(steps: tuple[int, ...] = (100, 400, 1600, 6400), nx: int = 6) -> pd.DataFrame:
-    """Return the scratch memory of gradients through runs, as compiled, with √steps segments and with one.
+    """Return the scratch memory of gradients through runs of a dam break in 2D, as compiled, with √steps segments and with one.
 
-    Args:
-        steps: Square numbers.
-        nx: Of the scene, a dam break in 2D.
-
-    Returns:
-        Columns steps, segments, scratch [B], state [B] (one state), states (scratch in states).
+    Numbers of steps are squares. Columns are steps, segments, scratch [B], state [B] (one state), states (scratch in states).
     """
     scene = fluids.fluid("dam-break-2d", nx=nx)
     model, s = make_model(scene), make_state(scene)

@@ -53,11 +53,8 @@ class Found(NamedTuple):
 def solve(problem: Problem, evaluations: int = 30) -> Found:
     """Go down a loss by its gradient (L-BFGS): each evaluation is a run, and the run back.
 
-    Args:
-        problem: The problem.
-        evaluations: At most so many, but for those that a line search takes to its end.
-
-    Source: Byrd et al. (1995), doi:10.1137/0916069.
+    There are at most so many evaluations, but for those that a line search takes to its end. Source: Byrd et al. (1995),
+    doi:10.1137/0916069.
     """
     both = jax.jit(jax.value_and_grad(problem.loss))
     tried: list[tuple[np.ndarray, float]] = []
@@ -73,13 +70,9 @@ def solve(problem: Problem, evaluations: int = 30) -> Found:
 
 
 def viscosity(*, ny: int = 18, time: float = 1e-3, guess: float = 50.0, backend: str = "auto") -> Problem:
-    """Seek the viscosity of a fluid between plates from its profile: the exact one of 100 m²/s, a moment after a force set in.
+    """Seek the viscosity [m²/s] of a fluid between plates from its profile: the exact one of 100, a time [s] after a force set in.
 
-    Args:
-        ny: Particles from plate to plate.
-        time: When the profile is seen [s].
-        guess: First guess [m²/s].
-        backend: Of `jfrnn.pair_sum`.
+    There are `ny` particles from plate to plate.
     """
     scene = fluids.fluid("poiseuille", ny=ny)
     model, s = make_model(scene, backend=backend), make_state(scene)
@@ -96,14 +89,9 @@ def viscosity(*, ny: int = 18, time: float = 1e-3, guess: float = 50.0, backend:
 
 
 def jet(*, known: tuple[float, float] = (1.5, 0.8), guess: tuple[float, float] = (1.0, 0.0), backend: str = "brute") -> Problem:
-    """Seek the velocity with which a jet leaves its nozzle from where and when it lands, 0.3 m below.
+    """Seek the velocity [m/s] with which a jet leaves its nozzle from where and when it lands, 0.3 m below.
 
     The jet, 6 cm wide, enters row by row. A particle lands where its way crosses the ground, between two steps.
-
-    Args:
-        known: Velocity that makes what is seen [m/s].
-        guess: First guess [m/s].
-        backend: Of `jfrnn.pair_sum`.
     """
     scene = _jet_scene()
     model, s = make_model(scene, backend=backend), make_state(scene)
@@ -161,15 +149,10 @@ def _crossings(model: Model, s: State, steps: int) -> Array:
 
 
 def droplet(*, goal: float = 0.4, intervals: int = 8, backend: str = "auto") -> Problem:
-    """Seek the force along the ground, constant in each of some intervals, that brings a falling droplet to rest at a goal.
+    """Seek the force along the ground, constant in each of some intervals, that brings a falling droplet to rest at a goal [m].
 
     The droplet, 8 cm across, falls onto the ground, spreads, and is to be, in the mean, `goal` further in the end and without speed
     along the ground; strong forces cost a little. Forces are accelerations, in units of 9.81 m/s².
-
-    Args:
-        goal: How far it is to move [m].
-        intervals: Of the force.
-        backend: Of `jfrnn.pair_sum`.
     """
     scene = droplet_scene()
     model, s = make_model(scene, backend=backend), make_state(scene)

@@ -34,10 +34,8 @@ def reverse(s: State) -> Array:
 def rotor(layers: int) -> FluidScene:
     """Return fluid at rest between a tube of dummy particles and a rod, a wall of segments that turns from the start on.
 
-    The fluid, of 1 kg/m², is denser than at rest by a fiftieth: under a pressure that keeps it at the rod, and means nothing else.
-
-    Args:
-        layers: Of particles between rod and tube.
+    The fluid, so many layers of 1 kg/m², is denser than at rest by a fiftieth: under a pressure that keeps it at the rod, and means
+    nothing else.
     """
     spacing = (OUTER - INNER) / layers
     physics = replace(free(1 / 1.02, 10 * RATE * INNER, spacing), viscosity=FRICTION, slip=False)

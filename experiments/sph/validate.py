@@ -91,12 +91,7 @@ def table(rows: list[Row]) -> pd.DataFrame:
     """Return a line per figure, and one for each case that has none."""
     lines = []
     for row in rows:
-        run_line = {
-            "particles": row["particles"],
-            "steps": row["steps"],
-            "seconds": row["seconds"],
-            "device": row.get("device") or "cpu",
-        }
+        run_line = {name: row[name] for name in ("particles", "steps", "seconds")} | {"device": row.get("device") or "cpu"}
         if not row["figures"]:
             lines.append({"case": row["key"], "quantity": row["reason"], "measured": "", "target": "", "met": "no"} | run_line)
         for figure in row["figures"]:
