@@ -23,7 +23,7 @@ def errors(found: Found, row: dict[str, Any], exact: np.ndarray, positions: np.n
     n = len(positions)
     if found.density is not None:
         density = sums(np.divmod(exact, n), None, positions, cutoff)[:, 0]
-        return {"density_error": float(np.abs(found.density - density).max() / _mean(density))}
+        return {"density_error": float(np.abs(found.density - density).max() / (density.mean() or 1.0))}
     if found.pairs is None:
         return {}
     if row["missing"] == row["extra"] == 0:
@@ -91,7 +91,3 @@ def _scale(exact: np.ndarray, positions: np.ndarray, cutoff: float) -> float:
     r = (positions[j].astype(np.float64) - positions[i]) / cutoff
     kernel = np.maximum(1 - (r**2).sum(axis=1), 0) ** 3
     return 2 * float(kernel.mean() if len(kernel) else 1.0) * max(len(exact), 1) / len(positions)
-
-
-def _mean(density: np.ndarray) -> float:
-    return float(density.mean()) or 1.0

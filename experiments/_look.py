@@ -79,11 +79,6 @@ def color_of(method: str, methods: Sequence[str]) -> str:
     return OURS if is_ours(method) else PEERS_COLORS[peers.index(method) % len(PEERS_COLORS)]
 
 
-def marker_of(method: str, methods: Sequence[str]) -> str:
-    """Return the marker of a method among those of a picture: no two of eight have the same."""
-    return MARKERS[list(methods).index(method) % len(MARKERS)]
-
-
 def make_axes(title: str, height: float) -> tuple[Figure, Axes]:
     """Return a figure as wide as a page, and its axes under a title."""
     figure = Figure(figsize=(WIDTH, height), layout="constrained")

@@ -85,11 +85,14 @@ def by_layout(rows: Sequence[SearchRow], quantity: Quantity) -> Figure:
     chosen = [name for name in _look.choose(_methods(rows)) if lines.get(name)]
     scenes = "layouts" if len({row.scene_key for row in rows}) > MOST_SCENES else "scenes"
     figure, axes = _look.make_axes(_look.headline(_only(found, chosen), quantity.what, scenes, _beside(rows)), 4.8)
-    _draw_lines(axes, lines, chosen)
+    for name in reversed(chosen):  # ours on top
+        axes.plot(*zip(*sorted(lines[name].items()), strict=True), **_style(name, chosen))
+    _make_room(axes, [value for name in chosen for value in lines[name].values()])
     axes.set_xticks(range(len(names)), names, rotation=40, ha="right", fontsize=8, rotation_mode="anchor")
     axes.set(yscale="log", xlim=(-0.3, len(names) - 0.7), xlabel=shared, ylabel=quantity.label)
     _look.label_logarithmic(axes.yaxis)
-    _name_lines(axes, lines, chosen)
+    last = {name: max(lines[name].items()) for name in chosen}
+    _look.write_names(axes, [(_look.name_of(name), *end, _look.color_of(name, chosen)) for name, end in last.items()])
     return figure
 
 
@@ -266,25 +269,15 @@ def _last(line: dict[int, float]) -> float:
 
 
 def _style(method: str, chosen: Sequence[str], size: float = 6.5) -> Any:  # noqa: ANN401
-    style = {"color": _look.color_of(method, chosen), "marker": _look.marker_of(method, chosen), "markersize": size}
+    marker = _look.MARKERS[list(chosen).index(method) % len(_look.MARKERS)]  # no two of eight have the same
+    style = {"color": _look.color_of(method, chosen), "marker": marker, "markersize": size}
     return style | {"linewidth": 2.0 if _look.is_ours(method) else 1.1, "markeredgecolor": "white", "markeredgewidth": 0.6}
-
-
-def _draw_lines(axes: Axes, lines: Lines, chosen: Sequence[str]) -> None:
-    for name in reversed(chosen):  # ours on top
-        axes.plot(*zip(*sorted(lines[name].items()), strict=True), **_style(name, chosen))
-    _make_room(axes, [value for name in chosen for value in lines[name].values()])
 
 
 def _make_room(axes: Axes, drawn: Sequence[float]) -> None:
     """Show what is about one and the same number: around that, Matplotlib finds no decade."""
     if drawn and max(drawn) < 1.01 * min(drawn):
         axes.set_ylim(min(drawn) / 2, max(drawn) * 2)
-
-
-def _name_lines(axes: Axes, lines: Lines, chosen: Sequence[str]) -> None:
-    ends = [(_look.name_of(name), max(lines[name]), lines[name][max(lines[name])], _look.color_of(name, chosen)) for name in chosen]
-    _look.write_names(axes, ends)
 
 
 def _strip(scene: list[SearchRow], value: Value, error: Value, title: str, label: str, errors: str) -> Figure:

@@ -74,7 +74,8 @@ def _draw_space(axes: Axes3D, scene: "Scene", points: np.ndarray) -> None:
     """Draw points in space, the nearer ones darker, and the edges of the domain. The y axis points away from the reader."""
     lower, upper = _bounds(scene)
     nearness = points @ np.array([1.0, -1.0, 0.6])
-    shades = {"c": nearness, "cmap": "Blues", "vmin": _floor(nearness), "depthshade": False}
+    low = nearness.min() - 0.6 * max(np.ptp(nearness), 1e-9)  # keeps the palest color from being white
+    shades = {"c": nearness, "cmap": "Blues", "vmin": float(low), "depthshade": False}
     axes.scatter(points[:, 0], points[:, 1], zs=points[:, 2], s=3, linewidths=0, **shades)  # pyright: ignore[reportArgumentType]
     for axis in range(3):
         for corner in np.ndindex(2, 2):
@@ -91,11 +92,6 @@ def _draw_space(axes: Axes3D, scene: "Scene", points: np.ndarray) -> None:
         axis.set_pane_color((1.0, 1.0, 1.0, 0.0))  # pyright: ignore[reportAttributeAccessIssue]
         axis.set_major_locator(MaxNLocator(4))
     axes.view_init(elev=22, azim=-50)
-
-
-def _floor(values: np.ndarray) -> float:
-    """Return a lower end of the color scale that keeps the palest color from being white."""
-    return float(values.min() - 0.6 * max(np.ptp(values), 1e-9))
 
 
 def _bounds(scene: "Scene") -> tuple[np.ndarray, np.ndarray]:

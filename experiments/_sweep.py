@@ -136,13 +136,9 @@ def ask(task: dict[str, Any], timeout: float, *, cold: bool = True, kernels: Pat
             return {"status": "timeout", "reason": f"not done after {timeout:g} s"}
     if done.returncode == 0:
         return json.loads(done.stdout)
-    return {"status": "failed", "reason": _explain_exit(done.returncode, done.stderr)}
-
-
-def _explain_exit(code: int, stderr: str) -> str:
-    """Say how a process ended that gave no answer."""
+    code = done.returncode
     how = f"ended by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
-    return f"the process {how}: {stderr.strip()[-REASON_LENGTH:]}"
+    return {"status": "failed", "reason": f"the process {how}: {done.stderr.strip()[-REASON_LENGTH:]}"}
 
 
 def merge(folder: Path, parts: Iterable[Path]) -> int:

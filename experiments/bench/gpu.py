@@ -208,18 +208,13 @@ def _plain_hashgrid(scene: lists.Scene) -> Callable[[], Any]:
     return hashgrid_plain.start(np.asarray(scene.x), scene.cutoff, scene.capacity)
 
 
-def _nvalchemi(scene: lists.Scene) -> Callable[[], Any]:
-    return functools.partial(lists.nvalchemi(scene), scene.x)
-
-
-def _wrong_hashgrid(scene: lists.Scene, found: Any) -> int:  # noqa: ANN401
-    return lists.wrong_counts(scene, found[1].array.numpy())
-
-
 COUNTS = "jfrnn warp, counts"
 _CALLS: dict[str, tuple[Callable[[lists.Scene], Callable[[], Any]], Callable[[lists.Scene, Any], int]]] = {
     "jfrnn warp": (_jitted(lists.search), lists.wrong_rows),
     COUNTS: (_jitted(lists.count), lists.wrong_counts),
-    "warp HashGrid": (_plain_hashgrid, _wrong_hashgrid),
-    "nvalchemi 0.5.0 cell_list": (_nvalchemi, lambda scene, found: lists.wrong_counts(scene, found[1])),
+    "warp HashGrid": (_plain_hashgrid, lambda scene, found: lists.wrong_counts(scene, found[1].array.numpy())),
+    "nvalchemi 0.5.0 cell_list": (
+        lambda scene: functools.partial(lists.nvalchemi(scene), scene.x),
+        lambda scene, found: lists.wrong_counts(scene, found[1]),
+    ),
 }

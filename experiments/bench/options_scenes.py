@@ -64,7 +64,7 @@ def options() -> list[Option]:
     rest.append(Option("ten far away", lambda n: _plain(n)._replace(x=jnp.asarray(_far(n)))))
     rest.append(Option("sum, the largest term", partial(_sum_alone, _largest)))
     rest.append(Option("sum, a table indexed by species", partial(_sum_alone, _by_species)))
-    rest.append(Option("a cutoff per particle, equal", _equal, AS_MANY))
+    rest.append(Option("a cutoff per particle, equal", lambda n: _own(_uniform(n), np.full(n, _radius(n))), AS_MANY))
     rest += [Option(f"a cutoff per particle within a factor of 2, {rule}", partial(_two, rule), AS_MANY) for rule in _RULES]
     rest.append(Option("a cutoff per pair of two species", _species, LARGEST))
     rest += [Option(f"cutoffs over a factor of {factor}, uniform points", partial(_spread, factor), AS_MANY) for factor in FACTORS]
@@ -144,10 +144,6 @@ def _by_species(n: int) -> Callable[[Any, Any, Any], Any]:
 def _own(x: np.ndarray, cutoffs: np.ndarray, rule: str = "gather") -> Asked:
     more = {} if rule == "gather" else {"radius_rule": rule}
     return Asked(jnp.asarray(x, jnp.float32), jnp.asarray(cutoffs, jnp.float32), more, peers=rule == "gather")
-
-
-def _equal(n: int) -> Asked:
-    return _own(_uniform(n), np.full(n, _radius(n)))
 
 
 def _two(rule: str, n: int) -> Asked:

@@ -7,7 +7,6 @@ import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator
 from functools import partial
-from importlib.metadata import PackageNotFoundError, version
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
@@ -15,6 +14,7 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 import typer
 
+from experiments import _machine
 from experiments._commands import check_names, finite
 from experiments.bench import table
 from experiments.pages import cpu
@@ -205,16 +205,11 @@ def command(
 
 def _rows(name: str, limit_s: float) -> Iterator[dict[str, Any]]:
     """Yield a row for each case of the catalog."""
+    package = PEERS[name].package
+    version = _machine.versions([package])[package] or "not installed"
     cases = [(row.title, case) for row in CATALOG for case in row.cases]
     for (title, case), answer in zip(cases, _answers(name, [case for _, case in cases], limit_s), strict=True):
-        yield {"row": title, "case": case, "peer": name, "version": _version(PEERS[name].package)} | answer
-
-
-def _version(package: str) -> str:
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return "not installed"
+        yield {"row": title, "case": case, "peer": name, "version": version} | answer
 
 
 def _answers(name: str, cases: list[str], limit_s: float) -> Iterator[dict[str, Any]]:

@@ -98,7 +98,8 @@ def _rows(scene: _Scene, cutoff: float, rounds: int, backend: Name, dtype: str, 
         wrong = {"missing": int(np.sum(within & ~near[asked])), "extra": int(np.sum(near[asked] & ~within))}
         if len(asked) == 0:
             asked, wrong = scene.points, {}
-        row = {"n": len(asked), "method": name, "peer": _peer_version(name)} | wrong
+        package = "warp-lang" if name.startswith("wp.") else name
+        row = {"n": len(asked), "method": name, "peer": str(_machine.versions([package])[package])} | wrong
         yield common | row | _times_of(taken, len(asked), processor)
 
 
@@ -170,11 +171,6 @@ def _repeat(call: Callable[[], Any]) -> tuple[Any, list[float], float]:
 
 _PEERS: dict[str, Callable[[_Scene], _Asked]] = {"libigl": _libigl, "trimesh": _trimesh}
 _MODULES = {"libigl": "igl", "trimesh": "trimesh"}
-
-
-def _peer_version(name: str) -> str:
-    package = "warp-lang" if name.startswith("wp.") else name
-    return str(_machine.versions([package])[package])
 
 
 def _times_of(seconds: list[float], n: int, processor: float) -> dict[str, Any]:

@@ -59,7 +59,8 @@ def known() -> str:
         ours, theirs = speeds(rows, LIST), {who: speeds(rows, who) for who in others}
         for n, row in sorted(ours.items()):
             cells = [_beside(row, of.get(n), who) for who, of in theirs.items()]
-            lines.append([machine(rows), whole(n), number(row["steps_per_s"]), *cells, _drift(row)])
+            drift = f"{float(row['drift']):.0e}".replace("e-0", "e-")
+            lines.append([machine(rows), whole(n), number(row["steps_per_s"]), *cells, drift])
     return markdown(("on", ">particles", ">jfrnn", *(f">{title}" for title in others.values()), ">jfrnn: drift"), lines)
 
 
@@ -72,10 +73,6 @@ def _beside(ours: Row, row: Row | None, who: str) -> str:
 
 def _speed(row: Row) -> float:
     return float(row["steps_per_s"])
-
-
-def _drift(row: Row) -> str:
-    return f"{float(row['drift']):.0e}".replace("e-0", "e-")
 
 
 def table(column: str) -> str:

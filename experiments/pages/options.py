@@ -108,10 +108,6 @@ def _density() -> str:
     return ", ".join(_times(float(row["sum_s"]) / float(row["list_s"])) for row in rows if row.get("sum_s"))
 
 
-def _where() -> str:
-    return ", ".join(each.name for each in machines())
-
-
 def spread_rows(where: Machine) -> list[Row]:
     """Return the rows of uniform points with cutoffs over ever larger factors, which make as many pairs."""
     return [
@@ -121,4 +117,4 @@ def spread_rows(where: Machine) -> list[Row]:
 
 TABLES = {"options": options, "cutoffs": cutoffs, "options-jax": by_arrays}
 VALUES: dict[str, Callable[[], str]] = {f"cost-{name}": partial(_cost, option) for name, option in _COSTS.items()}
-VALUES |= {"cost-density": _density, "cost-where": _where}
+VALUES |= {"cost-density": _density, "cost-where": lambda: ", ".join(each.name for each in machines())}

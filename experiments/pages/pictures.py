@@ -58,13 +58,10 @@ def _cpu(axes: Axes) -> None:
     axes.xaxis.set_major_formatter(lambda ms, _: plain(ms))
     others = {row["method"]: float(row["median_s"]) for row in rows if row["method"] not in cpu.OURS}
     first, ours = min(others, key=lambda name: others[name]), one(rows, method="warp") or {}
-    said = f"jfrnn's list is exact and {factor(others[first] / float(ours['median_s']))} times as fast as {_brief(first)}"
+    brief = cpu.name_of(first).partition(" (")[0]
+    said = f"jfrnn's list is exact and {factor(others[first] / float(ours['median_s']))} times as fast as {brief}"
     _entitle(axes, f"{said}, the next. Hollow: pairs missing or extra")
     _clear(axes)
-
-
-def _brief(method: str) -> str:
-    return cpu.name_of(method).partition(" (")[0]
 
 
 def _gpu(axes: Axes) -> None:

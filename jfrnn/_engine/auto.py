@@ -45,10 +45,7 @@ def parse_backend(backend: object, engines: Mapping[str, AnyEngine], where: str 
 def choose_engine(named: Engine | None, sources: Array, queries: Array | None, kind: Features = ANYTHING) -> Engine:
     """Return this engine, or the fastest (None); raise if a named engine does not support the search or cannot run here.
 
-    Raises:
-        ImportError: it needs Warp, which is not installed.
-        RuntimeError: it needs Warp, which cannot run on the platform.
-        ValueError: it does not support the search.
+    An ImportError or a RuntimeError says that it needs Warp, which is not installed or cannot run on the platform.
     """
     if named is None:
         return fastest_engine(platform_of(sources, sources if queries is None else queries), sources.shape[0])

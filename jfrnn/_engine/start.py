@@ -35,13 +35,9 @@ def alone(work: Callable[[], Result]) -> Callable[[], Result]:
 
 @functools.cache
 def load_warp() -> ModuleType:
-    """Import Warp and start it, without a word of its own.
+    """Import Warp and start it, without a word of its own; warn once where it takes a temporary folder for its kernels.
 
-    Warns once where it takes a temporary folder for its kernels.
-
-    Raises:
-        ImportError: It is not installed, or another version is.
-        RuntimeError: It cannot start.
+    An ImportError says that it is not installed, or another version is, a RuntimeError that it cannot start.
     """
     warp, warning = apart(_load_warp)
     if warning is not None:

@@ -49,18 +49,10 @@ class Structure(NamedTuple):
 
 
 def find_structure_pairs(given: Structure, with_self: bool, wanted: Collection[str]) -> dict[str, np.ndarray]:
-    """Find all pairs of a structure closer than their cutoff, exactly, in ascending order of i.
+    """Find all pairs of a structure closer than their cutoff, exactly, in ascending order of i; each atom is its own `with_self`.
 
-    Args:
-        given: The structure.
-        with_self: Whether each atom is its own neighbor.
-        wanted: Some of "i", "j", "S", "D", "d".
-
-    Returns:
-        The arrays that are wanted, by name: i, j and S [pairs, 3] int64, D [pairs, 3] and d float64.
-
-    Raises:
-        ValueError: Positions or cell cannot be searched.
+    Those of the arrays that are wanted come by name: i, j and S [pairs, 3] int64, D [pairs, 3] and d float64. A ValueError says why
+    positions or cell cannot be searched.
     """
     n, room = len(given.positions), getattr(_kept, "room", _FIRST_ROOM)
     scratch = np.empty(REALS_PER_ATOM * n), np.empty(INTS_PER_ATOM * n + MORE_INTS, np.int32)

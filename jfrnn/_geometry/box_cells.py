@@ -136,17 +136,10 @@ def _row_major(cell: Array, counts: Array) -> Array:
 def box_runs(
     cells: BoxCells, systems: Array, lattice: Lattice, places: Array, which: Array, width: int
 ) -> tuple[Array, Array, Array]:
-    """Return some runs of the queries at these places of arrays: starts, ends and image codes, [b, width] int32.
+    """Return some runs of the queries at these places [b] of arrays: starts, ends and image codes, [b, width] int32.
 
-    A run is what a query visits of a row of cells along x, in one image. `which` counts passes of `width` runs.
-
-    Args:
-        cells: The cells; `from_cell` and `visited` are in the order of the places.
-        systems: [m] systems, likewise.
-        lattice: The lattice of each system.
-        places: [b] places of queries.
-        which: [] the number of the pass.
-        width: Runs of a pass.
+    A run is what a query visits of a row of cells along x, in one image. `which` [] counts passes of `width` runs. `from_cell` and
+    `visited` of the cells, and systems [m], are in the order of the places; the lattice is that of each system.
     """
     dim, of = len(lattice.images.reach), systems[places]
     low, visited, counts = (x[:, None] for x in (cells.from_cell[places], cells.visited[places], cells.counts[of]))

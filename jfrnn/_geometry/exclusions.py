@@ -192,10 +192,7 @@ def exclude_in_lattice(
 
     `moved` are the lattice vectors by which sources [n, d] and queries [m, d] were brought near, whole floats. A shift S between
     points as they are given is S - (those of i) + (those of j) between near points, and this, in short vectors if these are
-    searched, less the turns of i and more those of j, between wrapped ones.
-
-    Raises:
-        ValueError: names of images are more than int32 can number.
+    searched, less the turns of i and more those of j, between wrapped ones. Refused are more names of images than int32 has.
     """
     if rows.shifts is None:
         return ExcludedCodes(rows.starts, rows.others, None)

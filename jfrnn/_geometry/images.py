@@ -156,10 +156,8 @@ def check_images(images: Images, sources: int) -> Images:
 def grow_images(kind: Images, boxes: Sequence[Box], radius: float | None, dtype: np.dtype, sources: int, short: bool) -> Images:
     """Choose the images of a list that is made again: its present ones and those that the cutoff needs in each of these boxes.
 
-    `short` says that a search met a box that needs more images. If none of these boxes does, the reach is doubled.
-
-    Raises:
-        ValueError: a box is degenerate, or too small for this cutoff.
+    `short` says that a search met a box that needs more images. If none of these boxes does, the reach is doubled. Refused is a box
+    that is degenerate, or too small for this cutoff.
     """
     for box in boxes:
         check_box_values(box)

@@ -144,12 +144,7 @@ def order_for_tree(points: Array, classes: Array | None, systems: Array | None) 
 
     The curve halves the box around all points 29 times along each axis. What follows each other on it lies in a compact region,
     while a Morton curve jumps. Its keys are words of 32 bits, by which XLA sorts one after the other, the lowest first: sorts of
-    one word and an index are the fast ones on a GPU.
-
-    Args:
-        points: [n, d] coordinates, d = 2 or 3.
-        classes: [n] uint32 below `CLASSES`, or None: all are of one class.
-        systems: [n] uint32, the system of each point, or None: all are of one.
+    one word and an index are the fast ones on a GPU. Classes, below `CLASSES`, and systems are [n] uint32; None: all are of one.
     """
     n, dim = points.shape
     finite = jnp.isfinite(points).all(axis=1)

@@ -39,15 +39,10 @@ class Reverse(NamedTuple):
 
 
 def find_reverse(idx: Array, codes: Array | None, images: int, sources: int, mutual: bool, native: bool) -> Reverse:
-    """Find the slots of each source.
+    """Find the slots of each source of a list idx [m, capacity] int32, whose unused slots hold the number of sources.
 
-    Args:
-        idx: The list, [m, capacity] int32; unused slots hold the number of sources.
-        codes: The image code of each slot, or None if a pair has one image.
-        images: The number of image codes.
-        sources: The number of sources.
-        mutual: Whether the list is its own mirror image.
-        native: Whether Warp's kernels run where the list is.
+    There are codes of each slot where a pair has several images. `mutual` says that the list is its own mirror image, `native` that
+    Warp's kernels run where it is.
     """
     if 0 in (*idx.shape, sources):
         none = jnp.zeros(sources, jnp.int32)

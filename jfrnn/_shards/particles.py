@@ -284,12 +284,9 @@ def share_bits(status: Array, mesh: Mesh) -> Array:
 
 
 def check(met: Met, room: str) -> None:
-    """Raise what status bits report; `room` describes the present sizes.
+    """Raise what status bits report, outside of jit; `room` describes the present sizes.
 
-    Raises:
-        RuntimeError: a buffer overflowed.
-        ValueError: the data are invalid.
-        TypeError: called inside jit.
+    A RuntimeError tells of a buffer that overflowed, a ValueError of invalid data.
     """
     if isinstance(met.status, Tracer):
         raise TypeError("check() reads values and cannot run inside jax.jit: call it on what jit returns.")

@@ -64,9 +64,8 @@ def can_sum(inputs: engine.Inputs, term: Term) -> bool:
 def check(inputs: engine.Inputs, options: engine.Options, term: Term) -> None:
     """Raise if this engine was chosen by name and does not support the term; warn if "auto" falls back to a slower one.
 
-    Raises:
-        NoTranslationError: a primitive of the term, or of its derivative, has no translation.
-        TypeError: the kernel does not support a dtype.
+    A NoTranslationError tells of a primitive of the term, or of its derivative, a TypeError of a dtype that the kernel does not
+    have.
     """
     if not options.engine.translates:
         return
@@ -222,10 +221,9 @@ def extremes(
 ) -> list[tuple[Array, Array, Array | None]]:
     """Find the largest summands (or the negatives of the smallest) over all pairs of a search.
 
-    Returns:
-        For each summand, with its elements in one row: the largest values [rows, elements]; their sources, int32, n for none; and
-            in a box their lattice shifts [rows, elements, d]. Of equal values, that of the smallest source is chosen, of its images
-            any.
+    Return for each summand, with its elements in one row, the largest values [rows, elements]; their sources, int32, n for none;
+    and in a box their lattice shifts [rows, elements, d]. Of equal values, that of the smallest source is chosen, of its images
+    any.
     """
     search = engine.prepare_search(inputs, options)
     (values,), _, which = _launch(search, options, make_plan(term, *_kind(inputs), not largest), operands, False, extremes=True)

@@ -66,15 +66,10 @@ class _Lowered:
 def lower_sum(
     lower: Callable[..., Sequence], ctx: Internal, *args: Internal, term: Term, structure: Internal, compensated: bool
 ) -> list[Internal]:
-    """Lower a sum, alone or together with one before it.
+    """Lower a sum, alone or together with one before it, whose terms are `term` and the structure of whose relation is given.
 
-    Args:
-        lower: (context, *values, term, structure, compensated) -> values of a sum that stands alone.
-        ctx: The context, with the types of all values.
-        args: The values: leaves of the relation, then operands.
-        term: The summands.
-        structure: That of the relation.
-        compensated: As in `sum_pairs`.
+    `lower` makes the values of a sum that stands alone of the context, which has the types of all values, and the values: leaves of
+    the relation, then operands.
     """
     fault = find_fault() or (None if hasattr(ctx.module_context, "lowering_cache") else "a module keeps no lowering_cache")
     if fault is not None:

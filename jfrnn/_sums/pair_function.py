@@ -18,11 +18,9 @@ _NEEDS_A_VALUE = (
 
 
 def call_with_pair(fn: Callable[[Array, Tree, Tree], Tree], r: Array, i: Tree, j: Tree) -> Tree:
-    """Return fn(r, i, j) for one traced pair.
+    """Return fn(r, i, j) for one traced pair; an error of fn gets a note that describes its arguments.
 
-    Raises:
-        TypeError: fn does not take three arguments, or needs a concrete value, as `if` does.
-        Exception: any other error of fn, with a note that describes its arguments.
+    A TypeError says that fn does not take three arguments, or needs a concrete value, as `if` does.
     """
     _check_signature(fn, r, i, j)
     try:

@@ -281,18 +281,14 @@ def is_fused(relation: Relation, term: Term) -> TypeGuard[Searched]:
 
 
 def sum_pairs(relation: Relation, term: Term, operands: Groups, compensated: bool) -> list[Array]:
-    """Sum a term over all pairs of a relation; this specifies what every engine computes.
+    """Sum a term over all pairs (i, j) of a relation, with lattice shifts S; this specifies what every engine computes.
 
-    Args:
-        relation: The pairs (i, j), with lattice shifts S.
-        term: Its summands are t = term(True, S, (shared, own[i], others[j])).
-        operands: Arrays: `shared` of any shape, `own` [rows, ...], `others` [sources, ...].
-        compensated: Carry the rounding errors of the sums along, and add them at the end.
+    Summands are t = term(True, S, (shared, own[i], others[j])), of operands `shared` of any shape, `own` [rows, ...] and `others`
+    [sources, ...]. If `compensated`, the rounding errors of the sums are carried along, and added at the end.
 
-    Returns:
-        For each summand its sums over the neighbors j of each i, [rows, ...], or with `term.totals` over all pairs, [...]. Rows
-        without neighbors are 0, whatever their operands hold; but with `term.marks` those of an i whose position is not finite are
-        NaN (integers: the smallest one).
+    Return for each summand its sums over the neighbors j of each i, [rows, ...], or with `term.totals` over all pairs, [...]. Rows
+    without neighbors are 0, whatever their operands hold; but with `term.marks` those of an i whose position is not finite are NaN
+    (integers: the smallest one).
     """
     adder = _Adder(compensated)
     rows = relation.sizes[0]

@@ -64,19 +64,11 @@ def output_name(k: int, e: int) -> str:
 
 
 def translate(closed: ClosedJaxpr, ends: Ends | None = None) -> Translated:
-    """Translate a closed jaxpr into native text.
+    """Translate a closed jaxpr into native text; return the text, its inputs and its outputs.
 
-    Args:
-        closed: A result of `jax.make_jaxpr`, with arrays of float32, float64, int32, int64 or bool, each of at most MOST_ELEMENTS
-            elements.
-        ends: Tells positions and shift, of which there may be a text without shifts (`_displacements`).
-
-    Returns:
-        The text, its inputs and its outputs.
-
-    Raises:
-        NoTranslationError: a primitive or dtype without translation, an array of more than MOST_ELEMENTS elements, or more than
-            `jfrnn._sums.scalars.MOST_SCALARS` operations.
+    Arrays are of float32, float64, int32, int64 or bool. `ends` tells positions and shift, of which there may be a text without
+    shifts (`_displacements`). A NoTranslationError says which primitive or dtype has no translation, which array has more than
+    MOST_ELEMENTS elements, or that there are more than `jfrnn._sums.scalars.MOST_SCALARS` operations.
     """
     scalars, arguments, results = translate_scalars(closed)
     inputs = tuple(_spec(v.aval, "an input") for v in closed.jaxpr.invars)

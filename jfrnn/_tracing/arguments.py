@@ -43,15 +43,9 @@ RadiusRule = Literal["gather", "scatter", "either", "both", "mean", "sum"]
 def as_array(name: str, given: Given, dtype: np.dtype | type[float] | None = None) -> Given:
     """Return lists of numbers as a NumPy array, and everything else as it is; refuse arrays of other libraries.
 
-    Args:
-        name: The argument, for errors.
-        given: What a user passed.
-        dtype: What a list of numbers is converted to, `float` standing for float64 in JAX's 64-bit mode, else float32; default:
-            what NumPy makes of it.
-
-    Raises:
-        TypeError: a list is not one of numbers, or an array is neither one of JAX nor of NumPy, but can become one.
-        ValueError: a shape holds a symbol of `jax.export` in place of a number.
+    A list becomes an array of the dtype, `float` standing for float64 in JAX's 64-bit mode, else float32; without one, of what
+    NumPy makes of it. Errors name the argument: a TypeError tells of a list that is not one of numbers, or of an array that can
+    become one of JAX or NumPy, a ValueError of a symbol of `jax.export` in a shape.
     """
     if isinstance(given, list | tuple):
         return _of_numbers(name, given, dtype)

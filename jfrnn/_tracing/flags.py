@@ -8,18 +8,11 @@ _BITS = 32
 
 
 def set_places(flags: Array, most: int) -> Array:
-    """Return the indices of the first flags that are set, like `jax.numpy.nonzero` with a size.
-
-    Args:
-        flags: Shape [n], bool.
-        most: Number of indices, static.
-
-    Returns:
-        Indices, shape [most], int32, ascending, padded with n.
+    """Return the indices of the first flags [n] that are set, at most so many: [most] int32, ascending, padded with n.
 
     Cost: flags are read once and packed into words; each index is found in the cumulative counts of words, then in its word
-    (Jacobson 1989, doi:10.1109/SFCS.1989.63533). `nonzero` adds every flag to a histogram instead, which takes longer on CPU and
-    GPU.
+    (Jacobson 1989, doi:10.1109/SFCS.1989.63533). `jax.numpy.nonzero` adds every flag to a histogram instead, which takes longer on
+    CPU and GPU.
     """
     n = len(flags)
     words = -(-n // _BITS)

@@ -28,13 +28,9 @@ _platform: contextvars.ContextVar[str | None] = contextvars.ContextVar("platform
 def on_platform(
     *args: Tree, late: bool = False, default: Callable[..., Tree] | None = None, **branches: Callable[..., Tree]
 ) -> Tree:
-    """Call the function that `branches` has for the platform for which a program is compiled, else `default`.
+    """Call the function that `branches` has for the platform for which a program is compiled (cpu, cuda), else `default`.
 
-    Args:
-        args: What the function is given, pytrees of arrays.
-        late: Trace that function alone, while lowering; its results have the shapes of those of `cpu`, and no derivative.
-        default: For platforms that are not named.
-        branches: By names of platforms in JAX: cpu, cuda.
+    With `late`, that function alone is traced, while lowering; its results have the shapes of those of `cpu`, and no derivative.
     """
     platform = _platform.get()
     branch = None if platform is None else branches.get(platform, default)

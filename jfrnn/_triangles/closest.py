@@ -111,20 +111,13 @@ class Rows(NamedTuple):
 
 
 def pseudonormals(rows: Rows, faces: Array, corners: Array, good: Array, asked: Array) -> Array:
-    """Return unit pseudonormals at the nearest points of the rows `asked` for, [n, d]; 0 if shapes have no area.
+    """Return unit pseudonormals at the nearest points of the rows asked for [n] bool, [n, d]; 0 if shapes have no area.
 
     The pseudonormal of a face is its normal, that of a side the sum of the normals of the faces sharing it, and that of a vertex
     the sum over the faces around it, weighted with their angles; in 2D a vertex has the sum of both segments. All these faces are
-    equally near, so they are in the same row. Faces run counterclockwise as seen from outside; so do segments around what they
-    enclose.
+    equally near, so they are in the same row. Faces [f, corner] int32 run counterclockwise as seen from outside, so do segments
+    around what they enclose; their corners are [f, corner, d], and those that are valid `good` [f].
     Source: Baerentzen & Aanaes (2005), doi:10.1109/TVCG.2005.49.
-
-    Args:
-        rows: The rows.
-        faces: Vertex indices of shapes, shape [f, corner], int32.
-        corners: Corners of shapes, shape [f, corner, d].
-        good: Which shapes are valid, shape [f], bool.
-        asked: Which rows to compute, shape [n], bool.
     """
     n, capacity = rows.idx.shape
     block = min(max(_BLOCK // capacity, 1), n)
@@ -207,20 +200,15 @@ class _Slots(NamedTuple):
 
 
 def are_contacts(mask: Array, triangle: Array, faces: Array, seen: Array, vectors: Array, distance: Array, feature: Array) -> Array:
-    """Say which slots are separate contacts, [n, k] bool.
+    """Say which slots are separate contacts, [n, k] bool, of those in the mask [n, k] that hold a pair.
 
     A slot yields to another one that comes first if the other's triangle has the corner or side on which the slot's nearest point
     lies, or if both nearest points are equal within rounding. Slots are ordered by distance, then by feature (face, side, corner),
     then by index. The first of several such slots remains.
 
-    Args:
-        mask: Slots that hold a pair, shape [n, k], bool.
-        triangle: Index of the triangle, shape [n, k], int32, 0 where masked.
-        faces: Vertex indices of triangles, shape [f, corner], int32.
-        seen: Corners relative to the particle, shape [n, k, corner, d].
-        vectors: Vectors to the nearest points, shape [n, k, d].
-        distance: Their lengths, shape [n, k].
-        feature: The feature on which the nearest point lies, shape [n, k], as in `Nearest`.
+    Of each slot, `triangle` [n, k] is the index of its triangle, 0 where masked, in faces [f, corner]; `seen` [n, k, corner, d] are
+    the corners relative to the particle, and `vectors` [n, k, d] lead to the nearest point, over a `distance` [n, k], on a
+    `feature` [n, k], as in `Nearest`.
     """
     dim = faces.shape[1]
     named, alone = faces[triangle], feature >= (_FACE if dim == 3 else _SIDE)

@@ -24,15 +24,10 @@ _CHUNK = 1 << 13  # pairs at a time
 
 
 def are_crossed(points: Array, corners: Array, good: Array, idx: Array, used: Array, pairs: Array) -> Array:
-    """Say between which pairs of particles there is a triangle of the first one's row: [e] bool.
+    """Say between which pairs of particles [e, 2] there is a triangle of the first one's row: [e] bool.
 
-    Args:
-        points: Points, shape [n, d], n > 0.
-        corners: Corners of triangles, shape [f, corner, d], f > 0.
-        good: Which triangles are valid, shape [f], bool.
-        idx: Rows, shape [n, capacity], int32.
-        used: Number of slots in use per row, shape [n], int32.
-        pairs: Two points each, shape [e, 2], int32, e > 0; pairs with a number that no point has are not asked for.
+    Points are [n, d], rows idx [n, capacity] with so many slots `used` [n], triangles given by their corners [f, corner, d], of
+    which `good` [f] are valid; n, f and e are above 0. Pairs with a number that no point has are not asked for.
     """
     n, e, chunk = len(points), len(pairs), min(_CHUNK, len(pairs))
     there = jnp.all((pairs >= 0) & (pairs < n), axis=1)

@@ -148,12 +148,9 @@ def _combine(weights: Vector, x: list[Vector], zero: Array | None = None) -> Vec
 
 
 def refine(open_pairs: Array, asked_at: Callable[[Array], Asked], test: Callable[[Asked, Array, int], Array]) -> Array:
-    """Decide the pairs that floats left open, a few at a time; False elsewhere. Does nothing if no pair is open.
+    """Decide the open pairs [q] bool, which floats left, a few at a time; False elsewhere. Does nothing if no pair is open.
 
-    Args:
-        open_pairs: Shape [q], bool.
-        asked_at: Returns what is asked of the pairs at indices [k].
-        test: Decides it in integers, as `is_near`.
+    `asked_at` returns what is asked of the pairs at indices [k], and `test` decides it in integers, as `is_near`.
     """
 
     def decide(open_pairs: Array) -> Array:

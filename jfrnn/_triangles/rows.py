@@ -108,17 +108,9 @@ def nearest_slots(
 ) -> tuple[Array, Array]:
     """Find the nearest triangle in each row, for n > 0 and f > 0, in chunks of one pair per particle of a block.
 
-    Args:
-        points: Points, shape [n, d].
-        corners: Corners of triangles, shape [f, corner, d].
-        idx: Rows, shape [n, capacity], int32.
-        count: Number of slots in use per row, shape [n], int32.
-        good: Which triangles are valid, shape [f], bool.
-        cutoff: Only triangles closer than this count, exactly.
-        decide: Decides which pairs are closer.
-
-    Returns:
-        The slot of the nearest triangle, of equally near ones the first, shape [n], int32, and whether there is one, [n] bool.
+    Points are [n, d], rows idx [n, capacity] with so many slots [n] in use, triangles given by their corners [f, corner, d], of
+    which `good` [f] are valid. `decide` says which pairs are closer than the cutoff, exactly; only those count. Return the slot of
+    the nearest triangle, of equally near ones the first, [n] int32, and whether there is one, [n] bool.
     """
     n, capacity = idx.shape
     block = max(min(n, (_MOST_PAIRS - n) // capacity), 1)

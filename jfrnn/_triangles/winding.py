@@ -78,16 +78,10 @@ def ray_ways(dim: int, dtype: np.dtype) -> Array:
 def cast_rays(
     tree: TriangleTree, corners: Array, points: Array, rays: Array, asked: Array, least: Array, cutoff: Cutoff
 ) -> tuple[Array, Array]:
-    """Say which of the points asked for are inside a closed wall, and which of them no ray decides: [n] bool each.
+    """Say which of the points [n, d] asked for [n] are inside a closed wall, and which of them no ray decides: [n] bool each.
 
-    Args:
-        tree: The wall's triangles, in boxes widened by the cutoff.
-        corners: Corners of triangles, shape [f, corner, d], f > 0.
-        points: Points, shape [n, d].
-        rays: The directions from `ray_ways`.
-        asked: Which points to decide, shape [n], bool.
-        least: The least winding number of inside points, shape [], int32.
-        cutoff: The cutoff of the boxes.
+    The wall's triangles, f > 0, are given by their corners [f, corner, d], and by a tree of boxes widened by the cutoff; the rays
+    are directions from `ray_ways`. The winding number of inside points is at least `least` [].
     """
     dim = points.shape[1]
     top = tree.boxes[:, int(level_starts(len(corners))[-2]) :]

@@ -47,7 +47,8 @@ def _settings(scene: str, defaults: dict[str, Any], meanings: dict[str, str]) ->
         shown = str(list(default)) if isinstance(default, tuple) else shown
         said = [(others | meanings).get(key, ""), "" if bounds is None else f"({ranges.in_words(bounds)})"]
         lines.append(f"  {key}={shown}")
-        lines += [_wrap(" ".join(filter(None, said)), "      ")] if any(said) else []
+        margin: Any = dict.fromkeys(("initial_indent", "subsequent_indent"), 6 * " ")
+        lines += [textwrap.fill(" ".join(filter(None, said)), WIDTH, break_on_hyphens=False, **margin)] if any(said) else []
     return lines
 
 
@@ -66,7 +67,3 @@ def _meanings(documented: Any) -> dict[str, str]:  # noqa: ANN401
     text = (inspect.getdoc(_function(documented)) or "").partition("\nArgs:\n")[2].partition("\n\n")[0]
     found = re.findall(r"^    (\w+): (.*(?:\n        .*)*)", text, re.MULTILINE)
     return {name: " ".join(meaning.split()) for name, meaning in found}
-
-
-def _wrap(text: str, indent: str = "  ") -> str:
-    return textwrap.fill(text, WIDTH, initial_indent=indent, subsequent_indent=indent, break_on_hyphens=False)

@@ -151,10 +151,8 @@ def advance(flow: Flow, steps: Array | int) -> Flow:
     """Run steps, data; where `particles.overflow` is set afterwards, pairs may have been missing: `run` sees to that."""
 
     def step(k: Array, flow: Flow) -> Flow:
-        def migrate_if_due(particles: Particles) -> Particles:
-            return jax.lax.cond(k % flow.settle == 0, distributed.migrate, lambda same: same, particles)
-
-        return _with_solver(solver.step, replace(flow, particles=migrate_if_due(flow.particles)))
+        particles = jax.lax.cond(k % flow.settle == 0, distributed.migrate, lambda same: same, flow.particles)
+        return _with_solver(solver.step, replace(flow, particles=particles))
 
     return jax.lax.fori_loop(0, steps, step, flow)
 
