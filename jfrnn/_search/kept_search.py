@@ -229,7 +229,7 @@ class KeptSearch(KeptOptions):
             short = bool(np.any(np.asarray(jax.device_get(self.status)) & geometry.Status.BOX_TOO_SMALL.value))
             images = geometry.grow_images(images, (box, self.box), reach, self.dtype, self.source_count, short)
         options = self.problem.options._replace(images=images)
-        wider = _replace(self, problem=dataclasses.replace(self.problem, options=options))
+        wider = _replace(self, problem=dataclasses.replace(self.problem, options=options), box_numbers=None)
         if box is not None and images is not None:
             box = geometry.box_of_list(box, images, reach)
         inputs = self.problem.inputs(sources, rows, active, box, radii, self.batch, self.exclude)

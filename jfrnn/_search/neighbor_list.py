@@ -342,7 +342,8 @@ class NeighborList(KeptSearch):
         return plain and can_renew(inputs, self.problem.options, self.capacity)
 
     def _find_box_numbers(self, inputs: Inputs) -> BoxNumbers | None:
-        if self.verlet is None or inputs.box is None or self.cutoff is None or not self._may_renew(inputs):
+        there = self.box_numbers is not None  # then they stay, wherever the list has gone since
+        if self.verlet is None or inputs.box is None or self.cutoff is None or not (there or self._may_renew(inputs)):
             return None
         radius = make_cutoff(self.cutoff, self.dtype, self.closed).radius
         return call_apart(functools.partial(find_box_numbers, options=self.problem.options), inputs, radius)

@@ -55,3 +55,13 @@ def test_only_lists_that_renew_themselves_have_them():
     for options in ({}, {"skin": 0.1, "reverse": True}, {"skin": 0.1, "backend": "jax"}, {"skin": 0.1, "active": x[:, 0] > 1}):
         assert jfrnn.search(x, 1.0, box=box, **options).box_numbers is None
     assert jfrnn.search(x, 1.0, skin=0.1).box_numbers is None
+
+
+def test_a_list_that_went_to_another_platform_keeps_its_structure(monkeypatch):
+    x, box = jnp.asarray(np.random.default_rng(2).uniform(0, LENGTHS, (50, 3)), jnp.float32), jfrnn.Box(LENGTHS)
+    with monkeypatch.context() as on_cuda:
+        on_cuda.setitem(renew_warp.PLATFORMS, platform_of(x), "cuda")
+        nbrs = jfrnn.search(x, 1.0, skin=0.1, slack=1.5, box=box)
+    moved = jax.jit(lambda: jax.lax.scan(lambda kept, _: (kept.update(x, box), None), nbrs, None, length=2)[0])()
+    assert jax.tree.structure(moved) == jax.tree.structure(nbrs)
+    np.testing.assert_allclose(_energy(x, moved), _energy_of_search(x, box), rtol=1e-5)
