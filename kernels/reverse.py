@@ -7,18 +7,20 @@ from jfrnn.kernels._program import Entry, Kernel, declare
 
 ROWS_AT_ONCE = 64  # that a thread of the CPU takes
 _CHUNK = {"QUERY_CHUNK": ROWS_AT_ONCE}
-LANES_PER_SLOT = 8  # on CUDA
-LANES_PER_ROW = 32  # likewise, where rows become flat
+LANES_PER_SHORT_ROW = 8  # on CUDA, where what belongs to slots is summed, or copied
+LANES_PER_ROW = 32  # on CUDA, otherwise
 
 
 @functools.cache
-def reverse_kernels(code_bytes: int, cuda: bool) -> tuple[Kernel, Kernel]:
-    """Return what clears, and finds, the reverse slots of a list whose image codes take so many bytes, 0 where there are none."""
-    header, block = ("reverse.cuh", 256) if cuda else ("reverse_cpu.h", 1)
-    text = program(Kind(3, False), header, constants={"CODE_BYTES": code_bytes, **_CHUNK})
-    entries = (Entry(f"Reverse.{method}", block, 4) for method in ("clear", "run"))
-    clear, find = declare(f"reverse_{'cuda' if cuda else 'cpu'}_{code_bytes}", text, *entries, cuda=cuda)
-    return clear, find
+def reverse_kernels(code_bytes: int, ordered: bool, cuda: bool) -> tuple[Kernel, ...]:
+    """Return what finds the reverse slots of a list whose image codes take so many bytes, 0 where there are none.
+
+    On the CPU, a first kernel clears them. `ordered`: rows are taken in an order that is given (CUDA).
+    """
+    header, methods, block = ("reverse.cuh", ["run"], 128) if cuda else ("reverse_cpu.h", ["clear", "run"], 1)
+    text = program(Kind(3, False), header, constants={"CODE_BYTES": code_bytes, "ORDERED": ordered, **_CHUNK})
+    name = f"reverse_{'cuda' if cuda else 'cpu'}_{code_bytes}{'_ordered' * ordered}"
+    return tuple(declare(name, text, *(Entry(f"Reverse.{method}", block, 4) for method in methods), cuda=cuda))
 
 
 @functools.cache
@@ -37,6 +39,13 @@ def flatten_kernel(cuda: bool) -> Kernel:
     """Return the kernel that finds the slots of a list that hold a pair, one after another."""
     text = program(Kind(3, False), "flatten.h", constants=_CHUNK)
     return declare(f"flatten_{'cuda' if cuda else 'cpu'}", text, Entry("Flatten.run", 128 if cuda else 1, 8), cuda=cuda)[0]
+
+
+@functools.cache
+def pack_kernel(cuda: bool) -> Kernel:
+    """Return the kernel that makes rows of a common length those of a flat list."""
+    text = program(Kind(3, False), "pack.h", constants=_CHUNK)
+    return declare(f"pack_{'cuda' if cuda else 'cpu'}", text, Entry("Pack.run", 128 if cuda else 1, 8), cuda=cuda)[0]
 
 
 @functools.cache

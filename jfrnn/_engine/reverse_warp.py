@@ -1,19 +1,25 @@
 """Where the pairs of a list stand the other way round, by Warp's kernels."""
 
+from collections.abc import Callable
+
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
 from jfrnn._engine.launch import Call, Shapes, kernel
 from jfrnn._engine.plans import Clear, Launch, Plan, share
+from jfrnn._tracing import on_platform
 from jfrnn.kernels import Kernel, reverse
 
 
-def reverse_slots(idx: Array, codes: Array | None, images: int, cuda: bool) -> Array:
-    """Return the slot of (j, i) for each slot of (i, j), of the opposite image: [n, capacity] int32, n * capacity for none."""
-    width = 0 if codes is None else codes.dtype.itemsize
-    given = jnp.zeros(1, jnp.int32) if codes is None else codes
-    return _reverse_callable(width, images, cuda)(idx, given, output_dims={"slots": idx.shape, "info": 2})[0]
+def reverse_slots(idx: Array, codes: Array | None, order: Array | None, images: int, cuda: bool) -> Array:
+    """Return the slot of (j, i) for each slot of (i, j), of the opposite image: [n, capacity] int32, n * capacity for none.
+
+    `order` [n]: in which order CUDA takes rows (-1: as they come), or None.
+    """
+    width, nothing, ordered = 0 if codes is None else codes.dtype.itemsize, jnp.zeros(1, jnp.int32), cuda and order is not None
+    given = idx, nothing if codes is None else codes, order if ordered else nothing
+    return _reverse_callable(width, images, ordered, cuda)(*given, output_dims={"slots": idx.shape, "info": 2})[0]
 
 
 def slots_by_source(idx: Array, sources: int) -> tuple[Array, Array, Array]:
@@ -39,6 +45,23 @@ def flatten_slots(mask: Array, starts: Array, total: int, cuda: bool) -> tuple[A
     return receivers, slots
 
 
+def pack_rows(rows: Array, counts: Array, offsets: Array, sources: int, total: int) -> tuple[Array, Array]:
+    """Return the entries of rows [m, capacity] one after another, and the rows, [total] int32 each, padded by `sources` and m.
+
+    `counts` [m] are how many each row has, at most `capacity`; `offsets` [m + 1] are where it begins, and where the last one ends.
+    """
+
+    def on(cuda: bool) -> Callable[[Array, Array, Array], tuple[Array, Array]]:
+        def pack(*given: Array) -> tuple[Array, Array]:
+            dims = {"senders": total, "receivers": total, "info": 2}
+            senders, receivers, _ = _pack_callable(sources, cuda)(*given, output_dims=dims)
+            return senders, receivers
+
+        return pack
+
+    return on_platform(rows, counts, offsets, cpu=on(False), cuda=on(True))
+
+
 def _share_or_launch(found: Kernel, places: int, lanes: int, cuda: bool) -> list[Clear | Launch]:
     """Return the launch of a kernel: on CUDA so many lanes for each place, on the CPU threads that share the places."""
     return [Launch(found, lanes * places)] if cuda else [Clear("info", 8), share(found, places, reverse.ROWS_AT_ONCE)]
@@ -56,11 +79,22 @@ def _flatten_callable(cuda: bool) -> Call:
 
 
 @kernel
+def _pack_callable(sources: int, cuda: bool) -> Call:
+    def plan(shapes: Shapes, _: int) -> Plan:
+        (m, capacity), numbers = shapes["rows"], {"n": sources, "total": shapes["senders"][0]}
+        steps = _share_or_launch(reverse.pack_kernel(cuda), m, reverse.LANES_PER_SHORT_ROW, cuda)
+        return Plan(steps, numbers | {"m": m, "capacity": capacity})
+
+    results = dict.fromkeys(("senders", "receivers", "info"), np.int32)
+    return Call(f"jfrnn_pack_{'cuda' if cuda else 'cpu'}_{sources}", ("rows", "counts", "starts"), results, plan)
+
+
+@kernel
 def _collect_callable(width: int, double: bool, by_source: bool, cuda: bool) -> Call:
     def plan(shapes: Shapes, _: int) -> Plan:
         (n, _), found = shapes["sums"], reverse.collect_kernel(width, double, by_source, cuda)
         numbers = {"n": n, "capacity": shapes["slots"][-1], "all": shapes["values"][0]}
-        return Plan(_share_or_launch(found, n, reverse.LANES_PER_SLOT, cuda), numbers)
+        return Plan(_share_or_launch(found, n, reverse.LANES_PER_SHORT_ROW, cuda), numbers)
 
     name = f"jfrnn_collect_{'cuda' if cuda else 'cpu'}_{width}_{'f64' if double else 'f32'}{'_sorted' * by_source}"
     results = {"sums": np.float64 if double else np.float32, "info": np.int32}
@@ -68,16 +102,15 @@ def _collect_callable(width: int, double: bool, by_source: bool, cuda: bool) -> 
 
 
 @kernel
-def _reverse_callable(code_bytes: int, images: int, cuda: bool) -> Call:
+def _reverse_callable(code_bytes: int, images: int, ordered: bool, cuda: bool) -> Call:
     def plan(shapes: Shapes, _: int) -> Plan:
         n, capacity = shapes["idx"]
-        clear, find = reverse.reverse_kernels(code_bytes, cuda)
-        launch = Launch(find, reverse.LANES_PER_SLOT * n * capacity) if cuda else share(find, n, reverse.ROWS_AT_ONCE)
-        first = Launch(clear, n * capacity if cuda else 1)
-        return Plan([Clear("info", 8), first, launch], {"n": n, "capacity": capacity, "images": images})
+        *clear, find = reverse.reverse_kernels(code_bytes, ordered, cuda)
+        steps = [*map(Launch, clear), *_share_or_launch(find, n, reverse.LANES_PER_ROW, cuda)]
+        return Plan(steps, {"n": n, "capacity": capacity, "images": images})
 
-    name = f"jfrnn_reverse_{'cuda' if cuda else 'cpu'}_{code_bytes}_{images}"
-    return Call(name, ("idx", "codes"), dict.fromkeys(("slots", "info"), np.int32), plan)
+    name = f"jfrnn_reverse_{'cuda' if cuda else 'cpu'}_{code_bytes}_{images}{'_ordered' * ordered}"
+    return Call(name, ("idx", "codes", "order"), dict.fromkeys(("slots", "info"), np.int32), plan)
 
 
 @kernel

@@ -1,6 +1,7 @@
 """The compiled programs of a search: prepare its operands, run an engine, complete the status."""
 
 import functools
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -9,10 +10,13 @@ import numpy as np
 from jax import Array, lax
 
 from jfrnn._engine.arrays import complete_rows, fold_candidates, is_few, refuse_many
+from jfrnn._engine.auto import platform_of
 from jfrnn._engine.candidates import Candidates
 from jfrnn._engine.problem import Inputs, Options, Room, Rows, Search, bits_of, prepare_search, rows_asked, take_present
+from jfrnn._engine.reverse_warp import pack_rows
 from jfrnn._engine.runs import State, Visit, fold_neighbors
 from jfrnn._engine.tuning import Tuning, by_platform
+from jfrnn._engine.warp import copies_rows
 from jfrnn._geometry import NOT_FINITE, Cutoff, Status, are_whole, good_rows, mark_rows
 from jfrnn._tracing import compile_program
 
@@ -41,17 +45,44 @@ class FoundFlat(NamedTuple):
 
 @functools.partial(compile_program, static_argnames=("options", "total"))
 def list_flat(inputs: Inputs, options: Options, total: int) -> FoundFlat:
-    """List the neighbors of every query in rows without gaps: count them, add up, and fill."""
-    counted = find_rows(inputs, options, None).rows
-    offsets = add_up(counted.counts)
-    found = find_rows(inputs, options, Room(jnp.minimum(offsets, total), total))
+    """List the neighbors of every query in rows without gaps: count them, add up, and fill.
+
+    On CUDA, rows of a common length are as fast to write as counts, so they are written at once, and copied. Where one is too short
+    for its neighbors, all are searched for once more.
+    """
+    capacity = _length_of_rows(inputs, options, total)
+    counted = find_rows(inputs, options, capacity).rows
+    offsets, status = add_up(counted.counts), counted.status & ~Status.ROW_OVERFLOW.value
+    status = status | jnp.where(offsets[-1] > total, Status.TOTAL_OVERFLOW.value, 0).astype(jnp.int32)
     m, n = len(counted.counts), len(inputs.sources)
-    there = lax.iota(jnp.int32, total) < offsets[-1]
-    idx, receivers = (jnp.where(there, jnp.asarray(x), most) for x, most in ((found.rows.idx, n), (found.rows.receivers, m)))
-    status = counted.status | jnp.where(offsets[-1] > total, Status.TOTAL_OVERFLOW.value, 0).astype(jnp.int32)
-    rows = Rows(idx, counted.counts, offsets[-1], status, None, receivers)
-    images = None if found.images is None else jnp.where(there, found.images, 0)
-    return FoundFlat(offsets, Found(rows, images, found.turns))
+
+    def find(inputs: Inputs, rows: Array | None, offsets: Array) -> Found:
+        found = find_rows(inputs, options, Room(jnp.minimum(offsets, total), total))
+        there = lax.iota(jnp.int32, total) < offsets[-1]
+        idx, receivers = (jnp.where(there, jnp.asarray(x), most) for x, most in ((found.rows.idx, n), (found.rows.receivers, m)))
+        images = None if found.images is None else jnp.where(there, found.images, 0)
+        return Found(Rows(idx, counted.counts, offsets[-1], status, None, receivers), images, found.turns)
+
+    def copy(inputs: Inputs, rows: Array, offsets: Array) -> Found:
+        idx, receivers = pack_rows(rows, counted.counts, offsets, n, total)
+        return Found(Rows(idx, counted.counts, offsets[-1], status, None, receivers), None, None)
+
+    if capacity is None:
+        return FoundFlat(offsets, find(inputs, None, offsets))
+    return FoundFlat(offsets, lax.cond(counted.required <= capacity, copy, find, inputs, counted.idx, offsets))
+
+
+def _length_of_rows(inputs: Inputs, options: Options, total: int) -> int | None:
+    """Return the length of rows that are copied into a flat list, or None if it is filled by itself.
+
+    Rows of random points are hardly ever longer: by six standard deviations.
+    """
+    n, m = len(inputs.sources), len(rows_asked(inputs)[0])
+    one_image = options.images is None or options.images.nearest
+    if not (copies_rows(options.engine, platform_of(inputs.sources), (n, m)) and one_image and total > 0):
+        return None
+    mean = total / m
+    return min(4 * math.ceil((mean + 6 * math.sqrt(mean)) / 4 + 1), n)
 
 
 def add_up(counts: Array) -> Array:

@@ -120,6 +120,11 @@ def has_order(engine: Engine, platform: str, n: int, plain: bool) -> bool:
     return engine.native and PLATFORMS.get(platform) == "cuda" and n > few_cuda.MOST and plain
 
 
+def copies_rows(engine: Engine, platform: str, sizes: tuple[int, int]) -> bool:
+    """Say whether rows of a common length are written and copied sooner than those of a flat list are counted and written."""
+    return engine.native and PLATFORMS.get(platform) == "cuda" and not all_meet(sizes, scaled=False)
+
+
 def by_cells_or_tree(cells: Callable[..., Found], tree: Callable[..., Found], search: Search, *more: tuple[Array, ...]) -> Found:
     """Search on CUDA by cells as wide as the largest cutoff if cutoffs are alike, but for few, else in a tree."""
     long = kind_of_search(search, Filter(drop_self=False, later_only=False)).long

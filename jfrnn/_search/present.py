@@ -38,21 +38,18 @@ class Reverse(NamedTuple):
     lengths: Array | None = None
 
 
-def find_reverse(idx: Array, codes: Array | None, images: int, sources: int, mutual: bool, native: bool) -> Reverse:
-    """Find the slots of each source of a list idx [m, capacity] int32, whose unused slots hold the number of sources.
-
-    There are codes of each slot where a pair has several images. `mutual` says that the list is its own mirror image, `native` that
-    Warp's kernels run where it is.
-    """
+def _find_reverse(topology: "Topology") -> Reverse:
+    """Find the slots of each source of a list."""
+    idx, codes, order, sources, images = topology.idx, topology.codes, topology.order, topology.sources, topology.images
+    mutual, native = topology.mutual, topology.native
     if 0 in (*idx.shape, sources):
         none = jnp.zeros(sources, jnp.int32)
         return Reverse(jnp.zeros(idx.shape, jnp.int32)) if mutual else Reverse(jnp.zeros(idx.size, jnp.int32), none, none)
+    if mutual and not native:
+        return Reverse(_reverse_by_comparing(idx, codes, images))
     if mutual:
-        arrays = functools.partial(_reverse_by_comparing, images=images)
-        if not native:
-            return Reverse(arrays(idx, codes))
         on_cpu, on_cuda = (functools.partial(reverse_slots, images=images, cuda=cuda) for cuda in (False, True))
-        return Reverse(on_platform(idx, codes, cpu=on_cpu, cuda=on_cuda))
+        return Reverse(on_platform(idx, codes, order, cpu=on_cpu, cuda=on_cuda))
     sort = functools.partial(_sort_slots, sources=sources)
     if not native:
         return Reverse(*sort(idx))
@@ -116,9 +113,7 @@ class Topology:
 
     def with_reverse(self) -> Reverse:
         """Return the slots of each source, found anew unless they are kept."""
-        if self.reverse is not None:
-            return self.reverse
-        return find_reverse(self.idx, self.codes, self.images, self.sources, self.mutual, self.native)
+        return _find_reverse(self) if self.reverse is None else self.reverse
 
     def merge(self) -> "Topology":
         """Return the lists of a batch, along the first axis of all arrays, as one list of all their rows and sources."""

@@ -15,7 +15,7 @@ from jfrnn import _engine as engine
 from jfrnn import _geometry as geometry
 from jfrnn._search.culprits import name_culprits
 from jfrnn._search.geometry import real_points
-from jfrnn._search.present import ImageCodes, find_reverse, make_topology
+from jfrnn._search.present import ImageCodes, Topology, make_topology
 from jfrnn._search.verlet import first_verlet
 from jfrnn._tracing import Given, Real, at_once, compile_program, own_transfers
 
@@ -262,7 +262,7 @@ def find_fields(
         sources = engine.hide_inactive(inputs.sources, engine.take_present(inputs).active)
         verlet = first_verlet(sources, inputs.queries, inputs.box, options.images, radii, inputs.batch)
     if reversing and rows.idx is not None and flat:
-        reverse = find_reverse(rows.idx[:, None], None, 1, n, False, options.engine.native)
+        reverse = Topology(rows.idx[:, None], None, None, None, n, 1, False, options.engine.native).with_reverse()
     elif reversing and rows.idx is not None:
         codes = None if images is None else images.codes
         topology = make_topology(options, n, inputs.queries is not None, radii, rows.idx, codes, None, rows.order)

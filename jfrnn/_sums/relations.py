@@ -10,7 +10,7 @@ from jax import Array, lax
 
 from jfrnn._engine import FOLD_GROUP, Block, Inputs, KeptList, Options, Slots, Visit, fold_pairs, kept_mask
 from jfrnn._geometry import EXCHANGED, Radii, are_finite, compensated_sum, mark_rows, rounded_sum
-from jfrnn._search import Reverse, find_reverse, kept_shifts
+from jfrnn._search import Reverse, Topology, kept_shifts
 from jfrnn._sums.fused import is_fused as is_fusible
 from jfrnn._sums.fused import sums as fused_sums
 from jfrnn._sums.fused import sums_of_list
@@ -266,7 +266,8 @@ class Kept:
         if not self.flipped:
             return self.given
         given = self.given
-        found = self.slots_by_source or find_reverse(given.idx, None, 1, given.sources.shape[0], mutual=False, native=True)
+        slots = Topology(given.idx, None, self.slots_by_source, None, given.sources.shape[0], 1, mutual=False, native=True)
+        found = slots.with_reverse()
         if found.starts is None or found.lengths is None:
             raise TypeError("a list that is its own mirror image is never flipped.")
         return given._replace(reversal=(found.slots, found.starts, found.lengths))

@@ -12,6 +12,7 @@ from by_numpy import add_up, in_order, pull
 from checked import slow, slowly, sparing
 
 import jfrnn
+from jfrnn._engine import rows as engine_rows
 from jfrnn._engine.rows import add_up as add_up_rows
 
 LENGTHS = {"open": None, "nearest": [1.0, 1.0, 1.0], "images": [0.5, 0.3, 1.0]}
@@ -259,3 +260,21 @@ def test_own_images_in_half_lists(backend, include_self):
         rows = jfrnn.search(x, CUTOFF, **options)
         rows.check()
         np.testing.assert_array_equal(rows.count, np.bincount([i for i, *_ in expected], minlength=5))
+
+
+@pytest.mark.parametrize("asked", ["", "half", "include_self", "queries", "box"])
+@pytest.mark.parametrize("total", [10, 100_000], ids=["too short", "long"])
+@pytest.mark.parametrize("dense", [0, 300], ids=["all rows fit", "rows that overflow"])
+def test_rows_that_are_copied_are_those_that_are_filled(monkeypatch, asked, total, dense):
+    rng = np.random.default_rng(0)
+    x = jnp.asarray(np.concatenate([rng.random((2000, 3)), 0.02 * rng.random((dense, 3))]), jnp.float32)
+    given = {"queries": x[:700] + 0.01, "box": jfrnn.Box([1.0, 1.0, 1.0])}
+    options = {asked: given.get(asked, True)} if asked else {}
+    filled, copied = (_edges_with(monkeypatch, copies, x, total, options) for copies in (False, True))
+    jax.tree.map(np.testing.assert_array_equal, filled, copied)
+
+
+def _edges_with(monkeypatch, copies, x, total, options):
+    monkeypatch.setattr(engine_rows, "copies_rows", lambda *_: copies)
+    jax.clear_caches()
+    return jfrnn.search_edges(x, 0.1, total=total, **options)

@@ -1,46 +1,51 @@
-// Reverse slots on CUDA: for the pair (i, j) in a row of i, eight lanes read the row of j together until i is found. Pairs whose j
-// comes before i are found from the other side.
+// Reverse slots on CUDA: for the pair (i, j) in a row of i, a lane reads the row of j, eight ids at a time, until i is found. Rows are
+// taken as their particles follow each other in space, so that the rows of neighbors are near, too.
 #pragma once
 #include "reverse.h"
 
 struct Reverse : ListOfRows {
-    JFRNN_MEMBER explicit Reverse(const ReverseArguments& given) : ListOfRows(given) {}
+    const int row, lane;
 
-    // A lane reads four ids of 32 at a time: at once, where rows begin at multiples of 16 bytes.
+    JFRNN_MEMBER explicit Reverse(const ReverseArguments& given)
+        : ListOfRows(given), row(row_at((int)(thread_index() >> 5), given)), lane((int)(thread_index() & 31)) {}
+    // Where the first number is negative, or there are none, rows are taken as they come.
+    JFRNN_FUNCTION int row_at(int place, const ReverseArguments& given) {
+        return ORDERED && place < given.n && given.order[0] >= 0 ? given.order[place] : place;
+    }
+
     JFRNN_MEMBER void run() const {
-        constexpr unsigned int ALL_LANES = 0xffffffffu;
-        const long long thread = thread_index();
-        const int slot = (int)(thread >> 3), lane = (int)(thread & 7);
-        const bool there = thread >> 3 < (long long)none();
-        const int i = there ? slot / capacity : 0, j = there ? idx[slot] : n;
-        const int code = j < n ? opposite(code_at(slot)) : 0, row = j < n ? j * capacity : 0;
-        int found = capacity;
-        bool searching = j < n && j >= i;
-        for (int b = 0; __any_sync(ALL_LANES, searching); b += 32) {
-            const int from = b + 4 * lane;
-            if (searching)
-#pragma unroll
-                for (int k = 3; k >= 0; --k) {
-                    const int place = from + k;
-                    const bool same = place < capacity && idx[row + place] == i;
-                    if (same && (CODE_BYTES == 0 || code_at(row + place) == code))
-                        found = place;
-                }
-#pragma unroll
-            for (int step = 4; step > 0; step /= 2) {
-                const int other = __shfl_xor_sync(ALL_LANES, found, step);
-                found = other < found ? other : found;
-            }
-            searching = searching && found == capacity && b + 32 < capacity;
-        }
-        if (found < capacity && lane == 0) {
-            slots[slot] = row + found;
-            slots[row + found] = slot;
+        if (row >= n)
+            return;
+        for (int k = lane; k < capacity; k += 32) {
+            const int slot = row * capacity + k, j = idx[slot];
+            slots[slot] = j < n ? slot_in(j * capacity, row, opposite(code_at(slot))) : none();
         }
     }
-    // Before that, no slot has any.
-    JFRNN_MEMBER void clear() const {
-        if (thread_index() < none())
-            slots[thread_index()] = none();
+    // The slot of a source, with a code, in the row that begins at `begin`. Four ids are read at once, from multiples of 16 bytes on.
+    JFRNN_MEMBER int slot_in(int begin, int source, int code) const {
+        const unsigned int end = (unsigned int)(begin + capacity);
+        for (unsigned int from = (unsigned int)begin & ~3u; from < end; from += 8) {
+            const int4 first = four_from(from), second = four_from(from + 4);
+            const int ids[8] = {first.x, first.y, first.z, first.w, second.x, second.y, second.z, second.w};
+            unsigned int same = 0;
+#pragma unroll
+            for (int k = 0; k < 8; ++k)
+                same |= (unsigned int)(ids[k] == source) << k;
+            for (; same; same &= same - 1) {
+                const int found = (int)from + __ffs((int)same) - 1;
+                if (found >= begin && found < begin + capacity && (CODE_BYTES == 0 || code_at(found) == code))
+                    return found;
+            }
+        }
+        return none();
+    }
+    JFRNN_MEMBER int4 four_from(unsigned int slot) const {
+        const unsigned int all = (unsigned int)none();
+        if (slot + 4 <= all)
+            return *(const int4*)(idx + slot);
+        int ids[4];
+        for (int k = 0; k < 4; ++k)
+            ids[k] = slot + k < all ? idx[slot + k] : n;
+        return make_int4(ids[0], ids[1], ids[2], ids[3]);
     }
 };

@@ -50,8 +50,9 @@ def test_masks_and_sums_compile(number, other):
 
 
 @pytest.mark.parametrize("code_bytes", [0, 1, 2, 4])
-def test_reverse_slots_compile(code_bytes):
-    assert all(map(compiles, reverse.reverse_kernels(code_bytes, True)))
+@pytest.mark.parametrize("ordered", [False, True])
+def test_reverse_slots_compile(code_bytes, ordered):
+    assert all(map(compiles, reverse.reverse_kernels(code_bytes, ordered, cuda=True)))
 
 
 @pytest.mark.parametrize("by_source", [False, True])
