@@ -20,6 +20,7 @@ from experiments.bench.options_scenes import FIRST, Asked, Option, beside, densi
 
 Calls = dict[str, Callable[[], Any]]
 WHATS = ("list", "count", "sum")
+OF_LISTS = ("skin", "reverse", "flat")  # options of lists alone
 PEERS = {"scipy": "scipy-kdtree-nolist", "hashgrid": "hashgrid-plain"}
 COLUMNS = (
     *("platform", "backend", "n", "option", "beside", "spread", "entries", "beside_entries", "capacity", "rounds"),
@@ -86,8 +87,8 @@ def _plain_calls(n: int, backend: Name) -> tuple[Calls, table.Line]:
 
 def _compile(asked: Asked, backend: Name) -> tuple[Calls, table.Line]:
     """Return what lists, counts and sums a density, and entries and capacity; of half lists, and with a skin, there is no sum."""
-    given = {name: value for name, value in asked.more.items() if name != "skin"} | {"cutoff": asked.cutoff}
-    skin = asked.more.get("skin", 0.0)
+    given = {name: value for name, value in asked.more.items() if name not in OF_LISTS} | {"cutoff": asked.cutoff}
+    skin, reverse, flat = (asked.more.get(name, 0) for name in OF_LISTS)
     # Arrays are operands, no constants, but for exclusions: those that are known are sorted once, and not in each call.
     data: dict[str, Any] = {name: value for name, value in given.items() if hasattr(value, "shape") and name != "exclude"}
     more = {name: value for name, value in given.items() if name not in data}
@@ -108,13 +109,18 @@ def _compile(asked: Asked, backend: Name) -> tuple[Calls, table.Line]:
     longest = jfrnn.count(x, backend=backend, **given | {"cutoff": asked.cutoff + skin}) if skin else found
     about["capacity"] = capacity = round_capacity(int(longest.max()))
 
-    def list_pairs(x: jax.Array, data: dict[str, Any]) -> tuple[jax.Array, jax.Array]:
-        nbrs = jfrnn.search(x, skin=skin, capacity=capacity, backend=backend, **more, **data)
-        return nbrs.idx, nbrs.count
+    def list_pairs(x: jax.Array, data: dict[str, Any]) -> tuple[Any, ...]:
+        if flat:
+            edges = jfrnn.search_edges(x, total=about["entries"], backend=backend, **more, **data)
+            return edges.senders, edges.receivers
+        nbrs = jfrnn.search(x, skin=skin, reverse=bool(reverse), capacity=capacity, backend=backend, **more, **data)
+        return nbrs.idx, nbrs.count, nbrs.reverse
 
     search = jax.jit(list_pairs)
-    calls: Calls = {"list": lambda: search(x, data), "count": lambda: count(x, data)}
-    if not {"half", "skin"} & set(asked.more):
+    calls: Calls = {"list": lambda: search(x, data)}
+    if not (reverse or flat):
+        calls["count"] = lambda: count(x, data)
+    if not {"half", *OF_LISTS} & set(asked.more):
         calls["sum"] = lambda: summed(x, masses, data)
     return calls, about
 

@@ -100,6 +100,8 @@ _KINDS: dict[str, Callable[[np.random.Generator, int], dict[str, Any]]] = {
     "as many queries": lambda random, n: {"queries": jnp.asarray(random.random((n, 3)), jnp.float32)},
     "a tenth inactive": lambda random, n: {"active": jnp.asarray(random.random(n) < 0.9)},
     "skin of a tenth": lambda _, n: {"skin": 0.1 * _radius(n)},
+    "list with reverse slots": lambda _, n: {"reverse": True},
+    "flat list of edges": lambda _, n: {"flat": True},
     "excluded pairs": lambda _, n: {"exclude": np.stack([np.arange(n - 1), np.arange(1, n)], axis=1)},  # a chain
     "box, periodic": lambda _, n: {"box": jfrnn.Box([1.0, 1.0, 1.0])},
     "box, periodic along x": lambda _, n: {"box": jfrnn.Box([1.0, 1.0, 1.0], (True, False, False))},

@@ -12,7 +12,7 @@ from jax import Array, lax
 from jfrnn._engine.arrays import complete_rows, fold_candidates, is_few, refuse_many
 from jfrnn._engine.auto import platform_of
 from jfrnn._engine.candidates import Candidates
-from jfrnn._engine.problem import Inputs, Options, Room, Rows, Search, bits_of, prepare_search, rows_asked, take_present
+from jfrnn._engine.problem import Engine, Inputs, Options, Room, Rows, Search, bits_of, prepare_search, rows_asked, take_present
 from jfrnn._engine.reverse_warp import pack_rows
 from jfrnn._engine.runs import State, Visit, fold_neighbors
 from jfrnn._engine.tuning import Tuning, by_platform
@@ -50,11 +50,12 @@ def list_flat(inputs: Inputs, options: Options, total: int) -> FoundFlat:
     On CUDA, rows of a common length are as fast to write as counts, so they are written at once, and copied. Where one is too short
     for its neighbors, all are searched for once more.
     """
-    capacity = _length_of_rows(inputs, options, total)
+    sizes, one_image = (len(inputs.sources), len(rows_asked(inputs)[0])), options.images is None or options.images.nearest
+    capacity = length_of_rows(options.engine, platform_of(inputs.sources), sizes, total) if one_image else None
     counted = find_rows(inputs, options, capacity).rows
     offsets, status = add_up(counted.counts), counted.status & ~Status.ROW_OVERFLOW.value
     status = status | jnp.where(offsets[-1] > total, Status.TOTAL_OVERFLOW.value, 0).astype(jnp.int32)
-    m, n = len(counted.counts), len(inputs.sources)
+    n, m = sizes
 
     def find(inputs: Inputs, rows: Array | None, offsets: Array) -> Found:
         found = find_rows(inputs, options, Room(jnp.minimum(offsets, total), total))
@@ -72,17 +73,15 @@ def list_flat(inputs: Inputs, options: Options, total: int) -> FoundFlat:
     return FoundFlat(offsets, lax.cond(counted.required <= capacity, copy, find, inputs, counted.idx, offsets))
 
 
-def _length_of_rows(inputs: Inputs, options: Options, total: int) -> int | None:
-    """Return the length of rows that are copied into a flat list, or None if it is filled by itself.
+def length_of_rows(engine: Engine, platform: str, sizes: tuple[int, int], total: int) -> int | None:
+    """Return the length of rows that become a flat list of `total` edges, or None if it is filled without them.
 
-    Rows of random points are hardly ever longer: by six standard deviations.
+    `sizes`: n and m. Rows of random points are hardly ever longer: by six standard deviations.
     """
-    n, m = len(inputs.sources), len(rows_asked(inputs)[0])
-    one_image = options.images is None or options.images.nearest
-    if not (copies_rows(options.engine, platform_of(inputs.sources), (n, m)) and one_image and total > 0):
+    if total == 0 or 0 in sizes or not copies_rows(engine, platform, sizes):
         return None
-    mean = total / m
-    return min(4 * math.ceil((mean + 6 * math.sqrt(mean)) / 4 + 1), n)
+    mean = total / sizes[1]
+    return min(4 * math.ceil((mean + 6 * math.sqrt(mean)) / 4 + 1), sizes[0])
 
 
 def add_up(counts: Array) -> Array:
