@@ -76,12 +76,12 @@ def list_flat(inputs: Inputs, options: Options, total: int) -> FoundFlat:
 def length_of_rows(engine: Engine, platform: str, sizes: tuple[int, int], total: int) -> int | None:
     """Return the length of rows that become a flat list of `total` edges, or None if it is filled without them.
 
-    `sizes`: n and m. Rows of random points are hardly ever longer: by six standard deviations.
+    `sizes`: n and m. Rows of random points are hardly ever longer: by six standard deviations. They begin at multiples of 64 bytes.
     """
     if total == 0 or 0 in sizes or not copies_rows(engine, platform, sizes):
         return None
     mean = total / sizes[1]
-    return min(4 * math.ceil((mean + 6 * math.sqrt(mean)) / 4 + 1), sizes[0])
+    return 16 * math.ceil((mean + 6 * math.sqrt(mean)) / 16)
 
 
 def add_up(counts: Array) -> Array:
