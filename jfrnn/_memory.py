@@ -147,9 +147,11 @@ def memory_plan(
         scratch = _compiled_scratch(_shapes_of(n, queries, dim, dtype, _device_of(where)), radius, chosen, capacity, total)
     elif total is not None:
         scratch += 8 * rows + 4  # counts, and where rows begin
-        scratch += 4 * total if where == "cpu" else 0  # where XLA writes one of the two arrays anew
         length = engine.length_of_rows(chosen, where, (n, rows), total)
-        scratch += 0 if length is None else 4 * rows * (length + 2)  # rows, and counts and starts once more, for a condition
+        if length is not None:
+            scratch += 4 * rows * (length + 2)  # rows, and counts and starts once more, for a condition
+        elif where == "cpu":
+            scratch += 4 * total  # XLA writes one of the two arrays anew
     if capacity is None and total is None:
         return MemoryPlan(0, scratch, chosen.name, counts_bytes=4 * rows)
     kept = (n + (queries or 0)) * dim * dtype.itemsize + 4 if check_skin(skin, float(radius.radius), dtype) else 0

@@ -47,7 +47,7 @@ class FoundFlat(NamedTuple):
 def list_flat(inputs: Inputs, options: Options, total: int) -> FoundFlat:
     """List the neighbors of every query in rows without gaps: count them, add up, and fill.
 
-    On CUDA, rows of a common length are as fast to write as counts, so they are written at once, and copied. Where one is too short
+    Rows of a common length are about as fast to write as counts, so kernels write many at once, and copy them. Where one is too short
     for its neighbors, all are searched for once more.
     """
     sizes, one_image = (len(inputs.sources), len(rows_asked(inputs)[0])), options.images is None or options.images.nearest
@@ -78,7 +78,7 @@ def length_of_rows(engine: Engine, platform: str, sizes: tuple[int, int], total:
 
     `sizes`: n and m. Rows of random points are hardly ever longer: by six standard deviations. They begin at multiples of 64 bytes.
     """
-    if total == 0 or 0 in sizes or not copies_rows(engine, platform, sizes):
+    if total == 0 or 0 in sizes or not copies_rows(engine, platform, sizes[1]):
         return None
     mean = total / sizes[1]
     return 16 * math.ceil((mean + 6 * math.sqrt(mean)) / 16)

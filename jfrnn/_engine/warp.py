@@ -43,6 +43,7 @@ from jfrnn.kernels import Kernel, Kind, _driver, cells_cpu, cells_cuda, few_cuda
 
 PLATFORMS = {"cpu": "cpu", "gpu": "cuda", "cuda": "cuda"}  # names in JAX, names of branches
 _CELLS = {"cpu": cells_cpu, "cuda": cells_cuda}
+_COPIED_FROM = {"cpu": 10_000, "cuda": few_cuda.MOST + 1}  # rows of flat lists: slower among 5000 on two cores, faster among 20 000
 QUERIES_PER_THREAD = 1024  # on the CPU, at least: among 1000, to wake a second thread takes as long as it saves
 
 # On CUDA, cutoffs that differ are searched in a tree if queries meet more sources than these within the largest cutoff: so many
@@ -120,9 +121,10 @@ def has_order(engine: Engine, platform: str, n: int, plain: bool) -> bool:
     return engine.native and PLATFORMS.get(platform) == "cuda" and n > few_cuda.MOST and plain
 
 
-def copies_rows(engine: Engine, platform: str, sizes: tuple[int, int]) -> bool:
+def copies_rows(engine: Engine, platform: str, queries: int) -> bool:
     """Say whether rows of a common length are written and copied sooner than those of a flat list are counted and written."""
-    return engine.native and PLATFORMS.get(platform) == "cuda" and not all_meet(sizes, scaled=False)
+    branch = PLATFORMS.get(platform)
+    return engine.native and branch is not None and queries >= _COPIED_FROM[branch]
 
 
 def by_cells_or_tree(cells: Callable[..., Found], tree: Callable[..., Found], search: Search, *more: tuple[Array, ...]) -> Found:
