@@ -14,6 +14,8 @@ POINTS = 512
 CHOSEN = {  # and the columns that their rows lack
     "open, whole list": (),
     "half": ("sum",),
+    "list with reverse slots": ("count", "sum", "peers"),
+    "flat list of edges": ("count", "sum", "peers"),
     "excluded pairs": ("peers",),
     "sum, the largest term": ("list", "count", "peers"),
     "a cutoff per particle within a factor of 2, either": ("peers",),
