@@ -1,6 +1,7 @@
 // How threads of the CPU share work: they hand themselves chunks of it from a counter.
 #pragma once
 
+#if !defined(__CUDACC__)
 // Calls `serve(from, to, chunk)` for each chunk of `size` numbers below `count` that this thread gets, until none is left.
 template <class Serve>
 void each_chunk(int& next, int count, int size, Serve serve) {
@@ -12,3 +13,4 @@ void each_chunk(int& next, int count, int size, Serve serve) {
         serve(from, count - from < size ? count : from + size, chunk);
     }
 }
+#endif

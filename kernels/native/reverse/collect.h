@@ -1,5 +1,6 @@
 // What belongs to the slots of a list, summed for their sources: each gathers from its slots, in order.
 #pragma once
+#include "chunks.h"
 #include "constants.h"
 #include "device.h"
 
@@ -47,11 +48,8 @@ struct Collect : CollectArguments {
     }
 #else
     void run() const {
-        for (;;) {
-            const int begin = __atomic_fetch_add(info, 1, __ATOMIC_RELAXED) * QUERY_CHUNK;
-            if (begin >= n)
-                return;
-            for (int source = begin; source < n && source < begin + QUERY_CHUNK; ++source) {
+        each_chunk(*info, n, QUERY_CHUNK, [&](int from, int to, int) {
+            for (int source = from; source < to; ++source) {
                 const int* const own = slots + first(source);
                 const int length = count(source);
                 real sum[WIDTH] = {};
@@ -60,7 +58,7 @@ struct Collect : CollectArguments {
                 for (int w = 0; w < WIDTH; ++w)
                     sums[(long long)WIDTH * source + w] = sum[w];
             }
-        }
+        });
     }
 #endif
 };

@@ -1,5 +1,6 @@
 // The slots of a list that hold a pair, one after another: what is read is which of them do, and where those of each row begin.
 #pragma once
+#include "chunks.h"
 #include "constants.h"
 #include "device.h"
 
@@ -39,18 +40,14 @@ struct Flatten : FlattenArguments {
     }
 #else
     void run() const {
-        for (;;) {
-            const int begin = __atomic_fetch_add(info, 1, __ATOMIC_RELAXED) * QUERY_CHUNK;
-            if (begin >= m)
-                return;
-            for (int row = begin; row < m && row < begin + QUERY_CHUNK; ++row) {
+        each_chunk(*info, m, QUERY_CHUNK, [&](int from, int to, int) {
+            for (int row = from; row < to; ++row) {
                 int edge = starts[row];
-                for (int slot = row * capacity; slot < (row + 1) * capacity && edge < total; ++slot) {
+                for (int slot = row * capacity; slot < (row + 1) * capacity && edge < total; ++slot)
                     if (holds_pair(slot))
                         write(edge++, row, slot);
-                }
             }
-        }
+        });
     }
 #endif
 };

@@ -1,10 +1,8 @@
 // Rows of a common length become those of a flat list, which follow each other without gaps.
 #pragma once
+#include "chunks.h"
 #include "constants.h"
 #include "device.h"
-#if !defined(__CUDACC__)
-#include "chunks.h"
-#endif
 
 // Row i has `counts[i]` of `capacity` entries, and begins at `starts[i]`; the last one ends at `starts[m]`. Behind that, senders are n
 // and receivers m.

@@ -58,3 +58,8 @@ def test_reverse_slots_compile(code_bytes, ordered):
 @pytest.mark.parametrize("by_source", [False, True])
 def test_sums_by_source_compile(by_source):
     assert compiles(reverse.collect_kernel(3, by_source, by_source, True))
+
+
+@pytest.mark.parametrize("kernel", [reverse.flatten_kernel, reverse.pack_kernel], ids=lambda make: make.__name__)
+def test_slots_one_after_another_compile(kernel):
+    assert compiles(kernel(cuda=True))
