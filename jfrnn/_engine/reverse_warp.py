@@ -85,7 +85,7 @@ def _pack_callable(sources: int, cuda: bool) -> Call:
         steps = _share_or_launch(reverse.pack_kernel(cuda), m, reverse.LANES_PER_SHORT_ROW, cuda)
         return Plan(steps, numbers | {"m": m, "capacity": capacity})
 
-    results = dict.fromkeys(("senders", "receivers", "info"), np.int32)
+    results = {"senders": np.int32, "receivers": np.int32, "info": np.int32}
     return Call(f"jfrnn_pack_{'cuda' if cuda else 'cpu'}_{sources}", ("rows", "counts", "starts"), results, plan)
 
 

@@ -47,8 +47,8 @@ class FoundFlat(NamedTuple):
 def list_flat(inputs: Inputs, options: Options, total: int) -> FoundFlat:
     """List the neighbors of every query in rows without gaps: count them, add up, and fill.
 
-    Rows of a common length are about as fast to write as counts, so kernels write many at once, and copy them. Where one is too short
-    for its neighbors, all are searched for once more.
+    Rows of a common length are about as fast to write as counts, so kernels write many at once, and copy them. Where one is too
+    short for its neighbors, all are searched for once more.
     """
     sizes, one_image = (len(inputs.sources), len(rows_asked(inputs)[0])), options.images is None or options.images.nearest
     capacity = length_of_rows(options.engine, platform_of(inputs.sources), sizes, total) if one_image else None
