@@ -109,7 +109,7 @@ NO_MEASUREMENTS = {  # bounds, defaults and definitions
     "docs/explanation/array-engine.md": [f"3 {TIMES}", "64 MB", "1 GB", "100 B", "125 B"],
     "docs/guides/kept-lists.md": ["4 B"],
     "docs/guides/many-devices.md": ["20 s"],
-    "docs/guides/memory.md": ["64 MB", "1 GB", "32 B", "400 kB", "4 B", "4 B", "4 B", "8 B", "4 B"],
+    "docs/guides/memory.md": ["64 MB", "1 GB", "32 B", "400 kB", "4 B", "4 B", "4 B", "8 B", "4 B", "4 B"],
     "docs/guides/search.md": [
         *("4 B", "8 B", "4 B", "8 B", "4 B", "4 B", "8 B", "4 B", "4 B", "4 B"),
         *("64 B", "84 B", "100 B", "125 B", "64 MB", "1 GB", "20 B", "40 B", "140 B", "180 B"),
