@@ -86,7 +86,10 @@ def _plain_calls(n: int, backend: Name) -> tuple[Calls, table.Line]:
 
 
 def _compile(asked: Asked, backend: Name) -> tuple[Calls, table.Line]:
-    """Return what lists, counts and sums a density, and entries and capacity; of half lists, and with a skin, there is no sum."""
+    """Return what lists, counts and sums a density, and entries and capacity.
+
+    Of half lists, and of options of lists alone, there is no sum, and of lists with reverse slots and flat ones no count.
+    """
     given = {name: value for name, value in asked.more.items() if name not in OF_LISTS} | {"cutoff": asked.cutoff}
     skin, reverse, flat = (asked.more.get(name, 0) for name in OF_LISTS)
     # Arrays are operands, no constants, but for exclusions: those that are known are sorted once, and not in each call.

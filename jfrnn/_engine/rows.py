@@ -50,27 +50,25 @@ def list_flat(inputs: Inputs, options: Options, total: int) -> FoundFlat:
     Rows of a common length are about as fast to write as counts, so kernels write many at once, and copy them. Where one is too
     short for its neighbors, all are searched for once more.
     """
-    sizes, one_image = (len(inputs.sources), len(rows_asked(inputs)[0])), options.images is None or options.images.nearest
-    capacity = length_of_rows(options.engine, platform_of(inputs.sources), sizes, total) if one_image else None
+    n, m = len(inputs.sources), len(rows_asked(inputs)[0])
+    one_image = options.images is None or options.images.nearest
+    capacity = length_of_rows(options.engine, platform_of(inputs.sources), (n, m), total) if one_image else None
     counted = find_rows(inputs, options, capacity).rows
     offsets, status = add_up(counted.counts), counted.status & ~Status.ROW_OVERFLOW.value
     status = status | jnp.where(offsets[-1] > total, Status.TOTAL_OVERFLOW.value, 0).astype(jnp.int32)
-    n, m = sizes
 
-    def find(inputs: Inputs, rows: Array | None, offsets: Array) -> Found:
+    def find() -> Found:
         found = find_rows(inputs, options, Room(jnp.minimum(offsets, total), total))
         there = lax.iota(jnp.int32, total) < offsets[-1]
         idx, receivers = (jnp.where(there, jnp.asarray(x), most) for x, most in ((found.rows.idx, n), (found.rows.receivers, m)))
         images = None if found.images is None else jnp.where(there, found.images, 0)
         return Found(Rows(idx, counted.counts, offsets[-1], status, None, receivers), images, found.turns)
 
-    def copy(inputs: Inputs, rows: Array, offsets: Array) -> Found:
-        idx, receivers = pack_rows(rows, counted.counts, offsets, n, total)
+    def copy() -> Found:
+        idx, receivers = pack_rows(jnp.asarray(counted.idx), counted.counts, offsets, n, total)
         return Found(Rows(idx, counted.counts, offsets[-1], status, None, receivers), None, None)
 
-    if capacity is None:
-        return FoundFlat(offsets, find(inputs, None, offsets))
-    return FoundFlat(offsets, lax.cond(counted.required <= capacity, copy, find, inputs, counted.idx, offsets))
+    return FoundFlat(offsets, find() if capacity is None else lax.cond(counted.required <= capacity, copy, find))
 
 
 def length_of_rows(engine: Engine, platform: str, sizes: tuple[int, int], total: int) -> int | None:

@@ -2,7 +2,8 @@
 #pragma once
 #include "codes.h"
 
-// `codes` are of CODE_BYTES each: 0 where a pair has one image; `order` is read where rows are ORDERED, on CUDA. The slot of a pair is row * capacity + its place in the row.
+// `codes` are of CODE_BYTES each: 0 where a pair has one image; `order` is read where rows are ORDERED, on CUDA. The slot of a pair is
+// row * capacity + its place in the row.
 struct ReverseArguments {
     const int *idx, *codes, *order;
     int *slots, *info;

@@ -14,6 +14,7 @@ from typer.testing import CliRunner
 import jfrnn
 from experiments import _config
 from experiments._cli import app
+from experiments._errors import UsageError
 from experiments.bench import decisions, gpu, lists
 
 CONFIG = ROOT / "experiments" / "configs" / "h200.toml"
@@ -37,6 +38,13 @@ def one_table(name, cases, **changes):
 @pytest.fixture
 def config():
     return load().model_copy(update={"calls": 2, "steps": 2, "repeats": 2, "sums": ()})
+
+
+def test_config_errors_name_the_key(tmp_path):
+    path = tmp_path / "gpu.toml"
+    path.write_text(CONFIG.read_text().replace("repeats = 5", "repeats = 0\nrepeat = 5"))
+    with pytest.raises(UsageError, match=r"(?s)gpu\.toml.*repeats.*repeat"):
+        _config.load(path, gpu.Config)
 
 
 def test_rows_of_a_scene_are_checked_and_timed(config):
