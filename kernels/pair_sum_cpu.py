@@ -183,7 +183,7 @@ def term_header(term: TermText, double: bool, turned: bool = True, by_rows: bool
     lines += ["struct Term {", *_members(term.shared), "struct Own {", *_members(term.own)]
     lines += [*(f"number turned{c};" for c in range(len(term.steps) if turned else 0)), "};"]
     lines += [*_of_shared(term, double), *(_own_by_rows(term, double) if by_rows else _of_own(term, double, turned))]
-    text = "\n".join([*lines, *_evaluation(term, double, turned, by_rows), "};", ""])
+    text = "\n".join([*lines, *_evaluation(term, double, turned, by_rows or not turned), "};", ""])
     return {"term.h": '#include "lattice.h"\n#include "math.h"\n' + text}
 
 
@@ -233,10 +233,11 @@ def _assign_own(term: TermText, places: list[str], turns: list[str], double: boo
     return ["Own own;", *lines, "return own;", "}"]
 
 
-def _evaluation(term: TermText, double: bool, turned: bool, by_rows: bool) -> list[str]:
-    """Return the lines that evaluate a term for a vector of pairs; `by_rows` in two ways, of which one is AT_HOME."""
-    lines = ["template <bool AT_HOME, class Column>" if by_rows else "template <class Column>"]
+def _evaluation(term: TermText, double: bool, turned: bool, apart: bool) -> list[str]:
+    """Return the lines that evaluate a term for a vector of pairs; `apart`: in two ways, of which one, AT_HOME, is for S = 0."""
+    lines = ["template <bool AT_HOME, class Column>" if apart else "template <class Column>"]
     lines += ["JFRNN_MEMBER void evaluate(const Own& own, const number* p, Column column, number* summand) const {"]
+    lines += ["JFRNN_CONTRACTED"]
     lines += [f"const Math::{_NAMES[value.dtype]} {value.name} = own.{value.name};" for value in term.own]
     numbers = place_values(term.others, "column({})", "p[{}]")
     lines += [load_value(value, x, f"Math::bits({x})", double) for value, x in zip(term.others, numbers, strict=True)]
@@ -244,7 +245,7 @@ def _evaluation(term: TermText, double: bool, turned: bool, by_rows: bool) -> li
         shift = f"column({term.columns + c})" + f" + own.turned{c}" * turned
         lines.append(f"const number {step.name} = SHIFTED ? {shift} : number{{}};")
     put = [f"summand[{k}] = {part.name};" for k, part in enumerate(term.sums)]
-    if by_rows and term.unshifted:
+    if apart and term.unshifted:
         lines += ["if constexpr (AT_HOME) {", term.unshifted, *put, "return;", "}"]
     return [*lines, term.text, *put, "}"]
 

@@ -90,7 +90,8 @@ def run(asked: str, packages: Path, kernels: Path, more: dict[str, str] | None =
     """
     not_given = ("XLA_PYTHON_CLIENT_PREALLOCATE", "JAX_COMPILATION_CACHE_DIR")
     environment = {name: value for name, value in os.environ.items() if name not in not_given}
-    environment |= {"PYTHONPATH": str(packages), "WARP_CACHE_PATH": str(kernels), "CUDA_CACHE_PATH": str(kernels / "cuda")}
+    paths = os.pathsep.join(filter(None, (str(packages), os.environ.get("PYTHONPATH"))))  # Warp may stand where the user says
+    environment |= {"PYTHONPATH": paths, "WARP_CACHE_PATH": str(kernels), "CUDA_CACHE_PATH": str(kernels / "cuda")}
     environment |= more or {}
     words = [sys.executable, "-P", "-W", "error::RuntimeWarning", fresh.__file__, asked]
     begin, bystanders = perf_counter(), _measure.Bystanders()

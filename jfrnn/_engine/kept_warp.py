@@ -147,7 +147,7 @@ def _kind_of(given: KeptList, cuda: bool) -> ListKind:
         reversed=is_reversed,
         aligned=given.idx.shape[1] % 4 == 0,
         ordered=given.order is not None and cuda,
-        lanes=kept.LANES if cuda else 0,
+        lanes=kept.lanes_of(given.rows.shape[0]) if cuda else 0,
         boxes=given.systems is not None,
         itself=isinstance(cutoff, Cutoffs) and cutoff.itself,
     )

@@ -8,7 +8,8 @@ from collections import Counter
 from collections.abc import Iterable
 from typing import NamedTuple
 
-from jfrnn._sums.scalars import Scalars
+from jfrnn._sums.scalars import NoTranslationError, Scalars
+from jfrnn._sums.scales import collect_scales
 
 _MOST_TERMS = 64  # of a sum that is looked at as a whole
 _MOST_DEPTH = 16  # of brackets in brackets
@@ -26,12 +27,21 @@ def factor_out(scalars: Scalars, outputs: Iterable[int]) -> dict[int, int]:
     outputs = list(outputs)
     needed, found = scalars.dependencies(outputs), {number: number for number in outputs}
     for scaled in (False, True):
-        work = _Factors(scalars, needed, scaled)
-        for number in sorted(needed):
-            work.visit(number)
-        other = {number: work.better[number] for number in outputs}
-        found = min(found, other, key=lambda each: len(scalars.dependencies(each.values())))
+        try:
+            other = _with_factors_out(scalars, needed, outputs, scaled)
+            collected = collect_scales(scalars, other.values())
+        except NoTranslationError:  # it would take more scalars than there may be
+            continue
+        both = other, {number: collected[better] for number, better in other.items()}
+        found = min(found, *both, key=lambda each: len(scalars.dependencies(each.values())))
     return found
+
+
+def _with_factors_out(scalars: Scalars, needed: set[int], outputs: Iterable[int], scaled: bool) -> dict[int, int]:
+    work = _Factors(scalars, needed, scaled)
+    for number in sorted(needed):
+        work.visit(number)
+    return {number: work.better[number] for number in outputs}
 
 
 class _Factors:

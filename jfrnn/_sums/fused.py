@@ -137,7 +137,7 @@ def make_plan(term: Term, dtype: np.dtype, periodic: tuple[bool, ...], negated: 
         return [-x for x in summands] if negated else summands
 
     wrapped = any(periodic) and not listed  # kernels of cells hold wrapped positions, so that those that were given have columns
-    translated = translate(jax.make_jaxpr(of_pair)(term.shift, term.operands), _ends(term) if wrapped else None)
+    translated = translate(jax.make_jaxpr(of_pair)(term.shift, term.operands), _ends(term) if any(periodic) else None)
     steps = tuple(Step(input_name(k, e), e) for k, e in translated.reads if k == 0)
     columns, values, before = [], [], 1
     for group, labels in zip(term.operands, ((), *term.labels), strict=True):

@@ -29,6 +29,13 @@ def energy(x):
     return 4 * (sixth * sixth - sixth)
 
 
+def faded(x):
+    """An energy with a smooth end, of which each particle of a pair has half."""
+    square = x @ x
+    fade = (6.25 - square) ** 2 * (6.25 + 2 * square - 12) / 11.390625
+    return energy(x) * fade / 2
+
+
 # a function of three numbers, and how many operations it takes at most
 FUNCTIONS = {
     "a force": (lambda x: -jax.grad(energy)(x) - jax.grad(energy)(x), 19),
@@ -37,6 +44,9 @@ FUNCTIONS = {
     "signs and constants": (lambda x: -(-x[0] * 3.0 * x[1]), 2),
     "some of several": (lambda x: x[0] * x[1] + x[2] + x[0] * x[2] - jnp.sqrt(x[1]), 6),
     "inner brackets": (lambda x: x[0] * x[1] * x[2] + x[0] * x[1] * x[1] + x[0] * x[2], 7),
+    "signs and powers of two": (lambda x: 4 * (x[0] * 0.5) * x[1] - 2 * (-x[0] * x[1]) + (x[0] - x[2]) * (x[2] - x[0]) * 0.25, 8),
+    "a force with a smooth end": (lambda x: jax.grad(faded)(x) * 0.5 + jax.grad(faded)(x) * 0.5, 35),
+    "products in another order": (lambda x: x[0] * (x[1] * x[2]) + x[1] * (x[2] * x[0]) + jnp.sqrt(x[2] * (x[0] * x[1])), 5),
     "nothing in common": (lambda x: x[0] * x[1] + x[2] * x[2], 3),
 }
 

@@ -22,6 +22,10 @@ struct KeptLane : Kept {
         return ORDERED && is_place(given) && given.order[0] >= 0 ? given.order[place] : place;
     }
 
+    template <bool VALUE>
+    struct Home {
+        static constexpr bool value = VALUE;
+    };
     struct Entries {
         int ids[AT_A_TIME], codes[AT_A_TIME];
     };
@@ -57,7 +61,8 @@ struct KeptLane : Kept {
                 if (place + k < all)
                     read_entry(first + place + k, some.ids[k], some.codes[k]);
     }
-    // Calls `visit(place, id, numbers, verdict, pair)` for the entries of the row that this lane takes. Those in doubt come once more,
+    // Calls `visit(home, place, id, numbers, verdict, pair)` for the entries of the row that this lane takes, at home (judge) where all
+    // of the warp are. Those in doubt come once more,
     // after they were decided: so rare a call stands outside of what every entry takes. `settle(place, pairs, lengths)` comes last: one
     // bit for each of the entries from `place` on, and (MEASURED) distances.
     template <class Visit, class Settle>
@@ -76,14 +81,28 @@ struct KeptLane : Kept {
             unsigned int pairs = 0;
             bool open = false;
             real lengths[AT_A_TIME];
+            auto judge_all = [&](auto home) {
 #pragma unroll
-            for (int k = 0; k < AT_A_TIME; ++k) {
-                const Verdict verdict = judged(own, numbers[k], some.ids[k], some.codes[k]);
-                lengths[k] = MEASURED ? length_of(verdict.vector) : real(0);
-                open |= verdict.open;
-                pairs |= verdict.sure ? 1u << k : 0;
-                visit(place + k, some.ids[k], numbers[k], verdict, verdict.sure);
+                for (int k = 0; k < AT_A_TIME; ++k) {
+                    const Verdict verdict = judged<home.value>(own, numbers[k], some.ids[k], some.codes[k]);
+                    lengths[k] = MEASURED ? length_of(verdict.vector) : real(0);
+                    open |= verdict.open;
+                    pairs |= verdict.sure ? 1u << k : 0;
+                    visit(home, place + k, some.ids[k], numbers[k], verdict, verdict.sure);
+                }
+            };
+            bool may = true;
+            if constexpr (NEAREST) {
+                may = false;
+#pragma unroll
+                for (int k = 0; k < AT_A_TIME; ++k)
+                    may |= may_turn(own, numbers[k]);
+                may = __any_sync(__activemask(), may);
             }
+            if (may)
+                judge_all(Home<false>());
+            else if constexpr (NEAREST)
+                judge_all(Home<true>());
             if (open) {  // what comes next is read again: it would leave its registers for calls that hardly ever happen
 #pragma unroll 1
                 for (int k = 0; k < AT_A_TIME && place + k < all; ++k) {
@@ -91,10 +110,10 @@ struct KeptLane : Kept {
                     read_entry(first + place + k, id, code);
                     real doubted[LENGTH];
                     load_numbers<LENGTH>(points + (long long)LENGTH * id, doubted);
-                    const Verdict verdict = judged(own, doubted, id, code);
+                    const Verdict verdict = judged<false>(own, doubted, id, code);
                     if (verdict.open && decide(own, doubted, verdict)) {
                         pairs |= 1u << k;
-                        visit(place + k, id, doubted, verdict, true);
+                        visit(Home<false>(), place + k, id, doubted, verdict, true);
                     }
                 }
                 read(first, place + AT_A_TIME * LANES_PER_ROW, all, next);
@@ -103,11 +122,12 @@ struct KeptLane : Kept {
             some = next;
         }
     }
+    template <bool HOME>
     JFRNN_MEMBER Verdict judged(const OwnPoint& own, const real* numbers, int id, int code) const {
         real step[3] = {0, 0, 0};
         for (int a = 0; CODED && a < DIM; ++a)
             step[a] = steps[DIM * code + a];
-        return judge(own, numbers, step, id != row);
+        return judge<HOME>(own, numbers, step, id != row);
     }
     JFRNN_MEMBER bool decide(const OwnPoint& own, const real* numbers, const Verdict& verdict) const {
         int shift[3] = {0, 0, 0};

@@ -59,8 +59,9 @@ struct Kept : KeptArguments, Space {
     Band<real> in_space;  // of pairs of points as they are, where all cutoffs are one
     real moved;           // the most that a shift of 1 along each axis adds up to in a component
     real most;            // the largest number of a shift for which pairs are decided
-    // Where lattice vectors lie along the axes: their lengths, and the reciprocals; 0 where space is open. No store can change them.
-    real sides[3], units[3];
+    // Where lattice vectors lie along the axes: their lengths, the reciprocals (0 where space is open), and a little less than their
+    // halves (there: infinity). No store can change them.
+    real sides[3], units[3], halves[3];
 
     int system;  // whose lattice it is
 
@@ -95,8 +96,10 @@ struct Kept : KeptArguments, Space {
             const bool turns = SHIFTED && !SKEWED && k < DIM && lattice.periodic(k);
             sides[k] = turns ? lattice.vector(k, k) : real(0);
             units[k] = turns ? lattice.transform(k, k) : real(0);
+            halves[k] = turns ? real(0.49) * sides[k] : Bits::not_finite();
         }
     }
+    JFRNN_MEMBER real scale() const { return SCALED ? step_scale : real(1); }  // which is known where it is 1
     JFRNN_INLINE static Number larger(Number x, Number y) { return Math::select(Math::gt(x, y), x, y); }
     JFRNN_FUNCTION real size_of(real x) { return x < 0 ? -x : x; }
 
@@ -131,21 +134,33 @@ struct Kept : KeptArguments, Space {
         return own;
     }
 
+    // Images are the nearest ones along the axes. Most pairs lie apart from the faces of the box, and are then decided as in open space.
+    static constexpr bool NEAREST = SHIFTED && !CODED && !SKEWED;
+    // (NEAREST) May the nearest image of a source be another one than the source itself? Not of slots that are not used.
+    JFRNN_INLINE Math::flag may_turn(const OwnPoint& own, const Number* numbers) const {
+        Math::flag found = Math::gt(Math::abs(numbers[0] - own.q[0]), Math::of(halves[0]));
+        for (int k = 1; k < DIM; ++k)
+            found = Math::either(found, Math::gt(Math::abs(numbers[k] - own.q[k]), Math::of(halves[k])));
+        return found;
+    }
+
     // What is found out about slots: the lattice shift, x_j - x_i with it, and whether it is a pair.
     struct Verdict {
         Number shift[3], vector[3];
         Math::flag sure, open;
     };
     // `step` (CODED): the shift of the image code of each slot; `other` (APART, ITSELF): the source of a slot is not its row. Slots that
-    // are not used hold no numbers (NaN), so they are neither sure nor open, unless nothing is DECIDED.
+    // are not used hold no numbers (NaN), so they are neither sure nor open, unless nothing is DECIDED. HOME: none may turn.
+    template <bool HOME>
     JFRNN_INLINE Verdict judge(const OwnPoint& own, const Number* numbers, const Number* step, Math::flag other) const {
+        constexpr bool MOVED = SHIFTED && !HOME;
         Math::flag used = Math::eq(Number{}, Number{});
         Number d[3], square{};
         Verdict found{};
         for (int k = 0; k < DIM; ++k)
             d[k] = numbers[k] - own.q[k];
         Number off{}, spans{};
-        if constexpr (SHIFTED) {
+        if constexpr (MOVED) {
             Number size{};
             for (int k = 0; k < DIM; ++k) {
                 if constexpr (CODED || SKEWED)
@@ -160,7 +175,7 @@ struct Kept : KeptArguments, Space {
             if constexpr (APART)
                 used = Math::both(used, Math::either(other, Math::gt(spans, Number{})));
             // twice the most that a component is off by (jfrnn/_geometry/lattice.py)
-            off = (size + (spans + real(1)) * moved) * (16 * step_eps * step_scale);
+            off = (size + (spans + real(1)) * moved) * (16 * step_eps * scale());
             for (int k = 0; k < DIM; ++k)
                 d[k] = d[k] + translation(found.shift, k);
         } else if constexpr (APART)
@@ -172,18 +187,19 @@ struct Kept : KeptArguments, Space {
             return found;
         }
         for (int k = 0; k < DIM; ++k) {  // as terms add squares, so that they are taken once
-            const Number scaled = d[k] * step_scale;
+            JFRNN_CONTRACTED
+            const Number scaled = d[k] * scale();
             square = k > 0 ? square + scaled * scaled : scaled * scaled;
         }
         Band<Number> band{Math::of(in_space.inside), Math::of(in_space.outside)};
         if constexpr (DIFFER)
-            band = Bands::bounds_of(Number(cutoff_of(own, numbers) * step_scale), off);
-        else if constexpr (SHIFTED)
+            band = Bands::bounds_of(Number(cutoff_of(own, numbers) * scale()), off);
+        else if constexpr (MOVED)
             band = Bands::of_one(Math::of(step_radius), off, Bands::IMAGES);
         Math::flag itself = Math::both(used, Math::both(Math::inverse(other), Math::eq(square, square)));
         found.sure = Math::both(used, Math::lt(square, band.inside));
         if constexpr (ITSELF) {
-            if constexpr (SHIFTED)
+            if constexpr (MOVED)
                 itself = Math::both(itself, Math::le(spans, Number{}));
             found.sure = Math::either(found.sure, itself);
         }
@@ -196,13 +212,13 @@ struct Kept : KeptArguments, Space {
         Number size{}, square{};
         for (int k = 0; k < DIM; ++k)
             size = larger(Math::abs(vector[k]), size);
-        const Math::flag small = Math::lt(size * step_scale, Math::of(SMALL));
+        const Math::flag small = Math::lt(size * scale(), Math::of(SMALL));
         for (int k = 0; k < DIM; ++k) {
-            const Number plain = vector[k] * step_scale, scaled = Math::select(small, plain * LARGE_UNIT, plain);
+            const Number plain = vector[k] * scale(), scaled = Math::select(small, plain * LARGE_UNIT, plain);
             square = square + scaled * scaled;
         }
         const Number length = Math::sqrt(square);
-        return Math::select(small, length / LARGE_UNIT, length) / step_scale;
+        return Math::select(small, length / LARGE_UNIT, length) / scale();
     }
     // Where vectors of the lattice do not lie along the axes: the shift of the nearest image along one of them.
     JFRNN_INLINE Number nearest(const Number* d, int k) const {

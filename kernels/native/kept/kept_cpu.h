@@ -11,6 +11,7 @@ struct KeptSlots {
     Number numbers[LENGTH];
     Kept::Verdict verdict;
     unsigned int pairs;
+    bool home;  // all of them: no nearest image is another one than the source itself
 };
 
 template <class Visitor>
@@ -88,13 +89,19 @@ struct KeptRows : Kept {
                 }
             }
             read_points(some.ids, some.numbers);
-            some.verdict = judge(own, some.numbers, step, __builtin_convertvector(lanes_from(some.ids) != row, Math::flag));
+            const Math::flag other = __builtin_convertvector(lanes_from(some.ids) != row, Math::flag);
+            some.home = NEAREST && bits_of_flags(may_turn(own, some.numbers)) == 0;
+            if (some.home)
+                some.verdict = judge<true>(own, some.numbers, step, other);
+            else
+                some.verdict = judge<false>(own, some.numbers, step, other);
             some.pairs = bits_of_flags(some.verdict.sure);
             if (unsigned int open = bits_of_flags(some.verdict.open)) {
+                const KeptSlots doubted = some;  // a copy, so that `some` needs no memory
                 if constexpr (PLAIN && !SCALED)
-                    some.pairs |= wide.sure(own.q, (const vec*)some.numbers, open);
+                    some.pairs |= wide.sure(own.q, (const vec*)doubted.numbers, open);
                 if (open)
-                    some.pairs |= decide(own, some, open);
+                    some.pairs |= decide(own, doubted, open);
             }
             visit(some);
         }

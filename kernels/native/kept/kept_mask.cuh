@@ -21,7 +21,7 @@ struct KeptMask : KeptLane {
             if constexpr (MEASURED)
                 out_lengths[place] = 0;
         }
-        auto nothing = [](int, int, const real*, const Verdict&, bool) {};
+        auto nothing = [](auto, int, int, const real*, const Verdict&, bool) {};
         walk(own_point(row), nothing, [&](int place, unsigned int pairs, const real* lengths) {
             unsigned char bits[AT_A_TIME];
             real length[AT_A_TIME];

@@ -45,7 +45,7 @@ struct KeptSlopes : KeptLane {
 #pragma unroll
         for (int k = 0; k < AT_A_TIME; ++k)
             if (distance[k] >= LEAST_DISTANCE) {
-                const Verdict verdict = judged(own, numbers[k], some.ids[k], some.codes[k]);
+                const Verdict verdict = judged<false>(own, numbers[k], some.ids[k], some.codes[k]);
                 const real reciprocal = 1 / distance[k], along = slope[k] + other[k];
                 for (int a = 0; a < DIM; ++a)
                     sum[a] += along * (verdict.vector[a] * reciprocal);

@@ -23,7 +23,7 @@ struct KeptSums : KeptLane {
         const Term term(shared_values);
         const Term::Own own_part = term.own(own_numbers(own_values, is_row ? row : 0), own.q);
         Reduction reduction(n);
-        auto visit = [&](int place, int id, const real* numbers, const Verdict& verdict, bool pair) {
+        auto visit = [&](auto home, int place, int id, const real* numbers, const Verdict& verdict, bool pair) {
             number summand[SUMMANDS];
             auto column = [&](int c) -> number {  // chosen, not indexed: what is indexed by a table does not stay in registers
                 const int axis = STEP_AXES[c < OTHERS ? 0 : c - OTHERS];
@@ -32,7 +32,7 @@ struct KeptSums : KeptLane {
                        : axis == 1 ? verdict.shift[1]
                                    : verdict.shift[2];
             };
-            term.evaluate(own_part, numbers, column, summand);
+            term.evaluate<home.value>(own_part, numbers, column, summand);
             reduction.add(summand, pair, [&](int& source, int& code) {
                 source = id;
                 code = place;

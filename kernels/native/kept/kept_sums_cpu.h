@@ -23,7 +23,10 @@ struct KeptSums : KeptRows<KeptSums> {
             auto column = [&](int c) -> number {
                 return c < OTHERS ? some.numbers[DIM + c] : some.verdict.shift[STEP_AXES[c < OTHERS ? 0 : c - OTHERS]];
             };
-            term.evaluate(own_part, some.numbers, column, summand);
+            if (some.home)
+                term.evaluate<true>(own_part, some.numbers, column, summand);
+            else
+                term.evaluate<false>(own_part, some.numbers, column, summand);
             reduction.add(summand, flags_of(some.pairs), [&](Math::i32& source, Math::i32& code) {
                 for (int l = 0; l < LANES; ++l) {
                     source[l] = some.ids[l];
