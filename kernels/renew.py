@@ -1,14 +1,15 @@
-"""Lists with a skin on CUDA that are renewed where they are stale, without the host: what stands around the kernels of a search."""
+"""Lists with a skin: whether they are stale, and what stands on CUDA around the search that renews them without the host."""
 
 import functools
 from typing import NamedTuple
 
-from jfrnn.kernels._native import Kind, program
+from jfrnn.kernels._native import Kind, declare_kind, program
 from jfrnn.kernels._program import Entry, Kernel, declare
 from jfrnn.kernels.cells_cuda import place_words
 
 BLOCK = 256
 _MOST_BLOCKS = 1024
+POINTS_AT_ONCE, POINTS_PER_THREAD = 256, 1 << 14  # that a thread of the CPU looks at, and for which one is worth it
 MOST_TURNS = (0, *((1 << k) - 1 for k in range(1, 10)))  # how far rounding goes is known for each of them, and one is chosen
 
 
@@ -35,3 +36,10 @@ def renew_kernels(dim: int, double: bool, periodic: bool, ordered: bool, told: t
     text = program(kind, "renew.cuh", constants=constants | dict(told))
     entries = [Entry(f"Renew.{method}", BLOCK, 4) for method in RenewKernels._fields]
     return RenewKernels(*declare(f"renew_cuda_{kind.name}{'_ordered' * ordered}", text, *entries, cuda=True))
+
+
+@functools.lru_cache(64)
+def moved_kernel(dim: int, double: bool, periodic: bool, told: tuple[tuple[str, int], ...]) -> Kernel:
+    """Return the kernel that says on the CPU whether a point has moved too far, with what `renew_kernels` is told."""
+    constants = {"QUERY_CHUNK": POINTS_AT_ONCE, **dict(told)}
+    return declare_kind(Kind(dim, double, periodic=periodic), "moved_cpu", "moved_cpu.h", "Moved.run", constants=constants)[0]

@@ -18,7 +18,7 @@ from jfrnn._engine.problem import (
     rows_asked,
     take_present,
 )
-from jfrnn._engine.renew_warp import BoxNumbers, KeptRows, can_renew, find_box_numbers, renew_list
+from jfrnn._engine.renew_warp import BoxNumbers, KeptRows, can_ask, can_renew, find_box_numbers, has_moved, renew_list
 from jfrnn._engine.reverse_warp import collect_slots, flatten_slots, reverse_slots, slots_by_source
 from jfrnn._engine.rows import add_up, count_rows, find_rows, fold_pairs, length_of_rows, list_flat, list_rows, mark_counts
 from jfrnn._engine.runs import FOLD_GROUP, Block, Slots, Visit

@@ -1,7 +1,7 @@
-"""Lists with a skin on CUDA that renew themselves where they are stale: one call, which tells the host nothing.
+"""Lists with a skin: on the CPU, whether one is stale; on CUDA they renew themselves in one call, which tells the host nothing.
 
-The device decides (`native/launch/launch.h`): kernels say whether a point has moved too far, and what is launched behind them, a
-search and what stands around it, runs if one has.
+There the device decides (`native/launch/launch.h`): kernels say whether a point has moved too far, and what is launched behind
+them, a search and what stands around it, runs if one has.
 """
 
 import functools
@@ -16,7 +16,7 @@ from jfrnn._engine.auto import platform_of
 from jfrnn._engine.kept_warp import numbers_of_pairs
 from jfrnn._engine.launch import Call, Shapes, kernel
 from jfrnn._engine.operands import MOST_IN_BOX, describe_call, lattice_numbers
-from jfrnn._engine.plans import Launch, Plan
+from jfrnn._engine.plans import Clear, Launch, Plan, share
 from jfrnn._engine.problem import Inputs, Options
 from jfrnn._engine.warp import PLATFORMS, all_meet, plan_few, plan_on_cuda
 from jfrnn._geometry import (
@@ -87,16 +87,45 @@ def find_box_numbers(inputs: Inputs, cutoff: np.floating | Array, options: Optio
     return BoxNumbers(numbers_of_box(inputs, options), numbers_of_pairs(cutoff, lattice), sides_of(lattice))
 
 
-def can_renew(inputs: Inputs, options: Options, capacity: int) -> bool:
-    """Say whether such a list renews itself: one of all particles, with one cutoff, in open space or a box along the axes."""
-    if PLATFORMS.get(platform_of(inputs.sources)) != "cuda":
-        return False
+def can_ask(inputs: Inputs, options: Options, platform: str) -> bool:
+    """Say whether a kernel may tell that a list is stale: of all particles, with one cutoff, in open space or an upright box."""
     images, cutoff = options.images, inputs.cutoff
     plain = options.engine.native and isinstance(cutoff, Cutoff) and not cutoff.scaled
-    alone = all(x is None for x in (inputs.queries, inputs.active, inputs.batch, inputs.exclude))
-    boxed = images is None or (images.nearest and images.orthogonal and not images.counts_short and not images.per_system)
-    n = inputs.sources.shape[0]
-    return plain and alone and boxed and capacity > 0 and 0 < n < MOST_IN_BOX
+    alone = inputs.queries is None and inputs.active is None
+    boxed = images is None or (images.orthogonal and not images.per_system)
+    return plain and alone and boxed and inputs.sources.shape[0] > 0 and PLATFORMS.get(platform_of(inputs.sources)) == platform
+
+
+def can_renew(inputs: Inputs, options: Options, capacity: int) -> bool:
+    """Say whether such a list renews itself, on CUDA: then none of its pairs has several images."""
+    images, alone = options.images, inputs.batch is None and inputs.exclude is None
+    boxed = images is None or (images.nearest and not images.counts_short)
+    return can_ask(inputs, options, "cuda") and alone and boxed and capacity > 0 and inputs.sources.shape[0] < MOST_IN_BOX
+
+
+def has_moved(inputs: Inputs, options: Options, reference: Array, of_then: Box | None, limit: np.floating | Array) -> Array:
+    """Say on the CPU whether any point has moved from its reference by the root of `limit`, or the box is another one, [] bool."""
+    now, box, dtype = inputs.sources, inputs.box, np.dtype(inputs.sources.dtype)
+    operands = [now, jnp.full(1, limit, dtype), reference]
+    if box is not None and of_then is not None and options.images is not None:
+        lattice = make_lattice(box, options.images, dtype)
+        operands.append(numbers_of_pairs(_one_cutoff(inputs).radius, lattice))
+        operands += [jnp.asarray(x, dtype) for x in (box.vectors, box.origin, of_then.vectors, of_then.origin)]
+    found, _ = _moved_callable(now.shape[1], dtype == np.float64, box is not None)(*operands, output_dims={"moved": 1, "info": 2})
+    return found[0] != 0
+
+
+@kernel
+def _moved_callable(dim: int, double: bool, boxed: bool) -> Call:
+    def plan(shapes: Shapes, _: int) -> Plan:
+        n, found = shapes["now"][0], renew.moved_kernel(dim, double, boxed, constants_of(double))
+        steps = [Clear("moved", 4), Clear("info", 8), share(found, n, renew.POINTS_PER_THREAD)]
+        return Plan(steps, {"n": n}, absent=[] if boxed else of_box)
+
+    of_box = ["cutoff", "vectors", "origin", "vectors_of_then", "origin_of_then"]
+    given = ("now", "limit", "reference", *(of_box if boxed else ()))
+    name = f"jfrnn_moved_{dim}d_{'f64' if double else 'f32'}{'_boxed' * boxed}"
+    return Call(name, given, dict.fromkeys(("moved", "info"), np.int32), plan)
 
 
 def constants_of(double: bool) -> tuple[tuple[str, int], ...]:

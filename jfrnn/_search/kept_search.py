@@ -13,7 +13,7 @@ from jax import Array, lax
 from jax.core import Tracer
 
 from jfrnn import _geometry as geometry
-from jfrnn._engine import BoxNumbers, Inputs, Options, hide_inactive, take_present
+from jfrnn._engine import BoxNumbers, Inputs, Options, can_ask, has_moved, hide_inactive, take_present
 from jfrnn._search.culprits import name_culprits
 from jfrnn._search.geometry import real_points
 from jfrnn._search.present import ImageCodes, Present, Reverse, Topology
@@ -78,6 +78,11 @@ class KeptSearch(KeptOptions):
         """Return what kernels are told of the box if the list may renew itself."""
         del inputs
         return None
+
+    def _motion_limit(self) -> np.floating | Array:
+        """Return the square of a motion below which a list in its own box holds."""
+        half = geometry.make_cutoff(self.skin / 2, self.dtype, closed=False)
+        return half.inside if self.box is None else geometry.widen(half, jnp.zeros((), self.dtype)).inside
 
     def _pairs_held(self) -> int:
         """Return how many pairs a padded list holds."""
@@ -314,7 +319,7 @@ def _update(
         nbrs = _replace(nbrs, box_numbers=nbrs._find_box_numbers(inputs))
     if stays and nbrs._may_renew(inputs):
         return on_platform(nbrs, inputs, cuda=type(nbrs)._renew, default=_make_again_if_stale)
-    return _make_again_if_stale(nbrs, inputs)
+    return _make_again_if_stale(nbrs, inputs, stays)
 
 
 def _make_again(nbrs: Kept, inputs: Inputs) -> Kept:
@@ -324,13 +329,28 @@ def _make_again(nbrs: Kept, inputs: Inputs) -> Kept:
     return _replace(made, status=made.status | nbrs.status, required=jnp.maximum(made.required, nbrs.required))
 
 
-def _make_again_if_stale(nbrs: Kept, inputs: Inputs) -> Kept:
-    """Let XLA decide: the host learns whether the list is stale."""
+def _has_moved_too_far(nbrs: KeptSearch, inputs: Inputs) -> Array:
     assert nbrs.verlet is not None
     sources, queries, _, box = inputs[:4]
     radii = inputs.cutoff if isinstance(inputs.cutoff, geometry.Radii) else None
     now = hide_inactive(sources, take_present(inputs).active)
-    moved = has_moved_too_far(nbrs.verlet, now, queries, box, nbrs.box_kind, radii, nbrs.skin, nbrs.batch)
+    return has_moved_too_far(nbrs.verlet, now, queries, box, nbrs.box_kind, radii, nbrs.skin, nbrs.batch)
+
+
+def _kernel_says_so(nbrs: KeptSearch, inputs: Inputs) -> Array:
+    assert nbrs.verlet is not None
+    return has_moved(inputs, nbrs.problem.options, nbrs.verlet.positions, nbrs.verlet.box, nbrs._motion_limit())
+
+
+def _make_again_if_stale(nbrs: Kept, inputs: Inputs, stays: bool = False) -> Kept:
+    """Let XLA decide: the host learns whether the list is stale. `stays`: no other box was given."""
+    assert nbrs.verlet is not None
+    box = inputs.box
+    radii = inputs.cutoff if isinstance(inputs.cutoff, geometry.Radii) else None
+    if stays and can_ask(inputs, nbrs.problem.options, "cpu"):
+        moved = on_platform(nbrs, inputs, cpu=_kernel_says_so, default=_has_moved_too_far)
+    else:
+        moved = _has_moved_too_far(nbrs, inputs)
     fixed = {"box": box, "box_numbers": nbrs.box_numbers, "radii": radii, "batch": nbrs.batch, "exclude": nbrs.exclude}
     # what stays is no state of the loop, so that XLA derives from it once what steps of a scan need
     left_out = dict.fromkeys(fixed)

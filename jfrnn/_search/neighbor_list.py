@@ -11,7 +11,7 @@ from jax import Array, lax
 from jax.core import Tracer
 
 from jfrnn._engine import BoxNumbers, Inputs, KeptRows, can_renew, find_box_numbers, renew_list
-from jfrnn._geometry import Box, Status, make_cutoff, pairs_and_status, shape_of, widen
+from jfrnn._geometry import Box, Status, make_cutoff, pairs_and_status, shape_of
 from jfrnn._search.edges import Edges, Graph, flat_edges, flat_pairs_of, make_graph, no_edges
 from jfrnn._search.exports import DenseNeighbors, check_held, check_total, flat_pairs, pair_total
 from jfrnn._search.geometry import lattice_shifts, norms, vectors_of
@@ -349,9 +349,8 @@ class NeighborList(KeptSearch):
         return call_apart(functools.partial(find_box_numbers, options=self.problem.options), inputs, radius)
 
     def _renew(self, inputs: Inputs) -> "NeighborList":
-        verlet, half = self.verlet, make_cutoff(self.skin / 2, self.dtype, closed=False)
+        verlet, limit = self.verlet, self._motion_limit()
         assert verlet is not None
-        limit = half.inside if self.box is None else widen(half, jnp.zeros((), self.dtype)).inside
         of_time = verlet.rebuild_count, verlet.positions, verlet.box
         kept = lax.stop_gradient(KeptRows(self.idx, self.count, self.status, self.required, *of_time, self.order))
         new = renew_list(inputs, self.problem.options, kept, limit, self.box_numbers)

@@ -3,8 +3,7 @@
 // The lists of all steps stand in the same arrays: what is kept is written only where a list is stale. A periodic box stands along the
 // axes, and a pair has one image in it. Of a box that has changed since, nothing is known but that.
 #pragma once
-#include "band.h"
-#include "space.h"
+#include "motion.h"
 
 struct RenewArguments {
     const real* now;      // [n, DIM], read, as all that follows but for what is kept and scratch
@@ -20,9 +19,10 @@ struct RenewArguments {
 };
 
 struct Renew : RenewArguments {
-    const Lattice lattice;
+    const Motion motion;
 
-    JFRNN_MEMBER explicit Renew(const RenewArguments& given) : RenewArguments(given), lattice(given.cutoffs) {}
+    JFRNN_MEMBER explicit Renew(const RenewArguments& given)
+        : RenewArguments(given), motion{given.now, given.reference, given.limit, Lattice(given.cutoffs)} {}
 
     // Says for each block whether one of its points has moved too far, or may have by rounding.
     JFRNN_MEMBER void check() const {
@@ -30,7 +30,7 @@ struct Renew : RenewArguments {
         for (int k = 0; PERIODIC && k < DIM; ++k)
             found |= vectors[k] != kept_vectors[k] || origin[k] != kept_origin[k];
         for (long long i = thread_index(); i < n; i += (long long)blocks * BLOCK)
-            found |= has_moved(i);
+            found |= motion.has_moved(i);
         found = __syncthreads_or(found);
         if (threadIdx.x == 0)
             stale[blockIdx.x] = found;
@@ -44,13 +44,13 @@ struct Renew : RenewArguments {
         int own_met = 0, own_near = 0;
         for (long long i = thread_index(); i < n; i += (long long)blocks * BLOCK) {
             real point[3], next[3];
-            take(i, point);
+            motion.take(i, point);
             for (int k = 0; k < DIM; ++k)
                 reference[DIM * i + k] = point[k];
             if constexpr (PERIODIC)
                 own_met |= write_row(i, point);
             if (ORDERED && i + 1 < n) {
-                take(i + 1, next);
+                motion.take(i + 1, next);
                 bool close = true;
                 for (int k = 0; k < DIM; ++k)
                     close &= fabs(next[k] - point[k]) <= (PERIODIC ? cutoffs[0] : cutoff[0]);
@@ -124,65 +124,12 @@ struct Renew : RenewArguments {
 private:
     // The row of `cutoffs` that holds for all turns that were met: of 0, and of powers of two less one.
     JFRNN_FUNCTION int row_of(int met) { return 32 - __clz(met & (MET_NOT_FINITE - 1)); }
-    // A point, near the box: one that is far away is moved by multiples of 256 vectors, exactly (jfrnn/_geometry/far.py).
-    JFRNN_MEMBER void take(long long i, real* p) const {
-        for (int k = 0; k < DIM; ++k) {
-            p[k] = now[DIM * i + k];
-            if (!PERIODIC || !lattice.periodic(k))
-                continue;
-            const real units = p[k] * lattice.transform(k, k), steps = rint(units / FAR_STEP);
-            if (fabs(units) < FAR || !(fabs(steps) <= FAR_MOST) || steps == 0)
-                continue;
-            const real length = lattice.vector(k, k), high = half_of(length), low = length - high, turns = steps * FAR_STEP;
-            p[k] = Lattice::add(Lattice::add(p[k], -Lattice::mul(turns, high)), -Lattice::mul(turns, low));
-        }
-    }
-    // A float rounded to half its mantissa.
-    JFRNN_FUNCTION real half_of(real x) {
-        constexpr int DROPPED = DOUBLE ? 27 : 12;
-        if constexpr (DOUBLE)
-            return __longlong_as_double((__double_as_longlong(x) + (1ll << (DROPPED - 1))) >> DROPPED << DROPPED);
-        else
-            return __uint_as_float((__float_as_uint(x) + (1u << (DROPPED - 1))) >> DROPPED << DROPPED);
-    }
-    JFRNN_MEMBER real turns_of(const real* p, int k) const {
-        return floor(Lattice::mul(Lattice::add(p[k], -lattice.origin(k)), lattice.transform(k, k)));
-    }
-    // Lattice vectors do not count as motion. Where rounding leaves open how many lie between, a point has moved.
-    JFRNN_MEMBER bool has_moved(long long i) const {
-        real point[3], difference[3], turns[3] = {0, 0, 0}, most = 0, square = 0;
-        const real* before = reference + DIM * i;
-        take(i, point);
-        if (!finite_point(point) && !finite_point(before))
-            return false;
-        bool sure = true, turned = false;
-        for (int k = 0; k < DIM; ++k) {
-            difference[k] = point[k] - before[k];
-            if (PERIODIC && lattice.periodic(k)) {
-                const real units = difference[k] * lattice.transform(k, k);
-                turns[k] = rint(units);
-                turned |= turns[k] != 0;
-                most = fabs(units) > most ? fabs(units) : most;
-                sure &= fabs(units - turns[k]) + 16 * EPS * (most + 2) < real(0.5);
-            }
-        }
-        for (int k = 0; k < DIM; ++k) {
-            real left = fabs(difference[k]);
-            if (PERIODIC && turned) {
-                sure &= !lattice.periodic(k) || fabs(turns_of(point, k)) <= LARGEST_TURN;
-                const real taken = turns[k] * lattice.vector(k, k);
-                left = fabs(difference[k] - taken) + 4 * EPS * (left + fabs(taken));
-            }
-            square += left * left;
-        }
-        return !(sure && square < limit[0]);
-    }
     // Writes a point and its packed turns (jfrnn/_geometry/wrapping.py), and returns what was met.
     JFRNN_MEMBER int write_row(long long i, const real* p) const {
         int packed = 0, met = 0;
         bool near = true;
         for (int k = 0; k < DIM; ++k) {
-            const real turns = lattice.periodic(k) ? turns_of(p, k) : real(0);
+            const real turns = motion.lattice.periodic(k) ? motion.turns_of(p, k) : real(0);
             near &= fabs(turns) <= LARGEST_TURN;
             const int whole_turns = near ? (int)turns : 0;
             packed |= (whole_turns + 512) << (10 * k);
