@@ -257,12 +257,13 @@ def test_in_two_dimensions_and_single_precision():
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-@pytest.mark.parametrize("side", [2.03, 2.4, 3.0])
+@pytest.mark.parametrize("side", [2.06, 2.4])
 def test_in_a_box_as_narrow_as_it_may_be(side, dtype):
     """Pairs whose nearest image is another one stand hardly farther apart than those whose is not; few, so that all go one way."""
     rng, box = np.random.default_rng(5), jfrnn.Box(np.full(2, side, dtype))
     x = jnp.asarray(rng.uniform(0, side, (4, 2)), dtype)
-    nbrs = jfrnn.search(x, 0.9, skin=0.1, box=box, capacity=4)
+    nbrs = jfrnn.search(x, 0.98, skin=0.02, box=box, capacity=4)
+    assert nbrs.images is None
     of_list = jax.jit(
         lambda nbrs, x: (jfrnn.pair_sum(lambda r, i, j: jnp.append(r, 1), x, None, neighbors=nbrs), nbrs.distances(x))
     )
@@ -271,7 +272,7 @@ def test_in_a_box_as_narrow_as_it_may_be(side, dtype):
         found, (distances, mask) = of_list(nbrs.update(x), x)
         r = np.asarray(x, float)[None] - np.asarray(x, float)[:, None]
         r -= side * np.round(r / side)
-        near = ((r**2).sum(2) < dtype(0.9) ** 2) & ~np.eye(4, dtype=bool)
+        near = ((r**2).sum(2) < dtype(0.98) ** 2) & ~np.eye(4, dtype=bool)
         np.testing.assert_allclose(found, (near[..., None] * np.append(r, np.ones((4, 4, 1)), 2)).sum(1), atol=1e-6)
         np.testing.assert_array_equal(np.sum(mask, axis=1), near.sum(1))
         np.testing.assert_allclose(np.sum(distances), np.sqrt((r**2).sum(2))[near].sum(), rtol=1e-6)
