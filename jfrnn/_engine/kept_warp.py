@@ -118,6 +118,7 @@ def kept_sums(given: KeptList, summed: Summed, values: tuple[Array, Array | None
             own = jnp.zeros((1, 1), given.sources.dtype) if own is None else own
             rows = (given.sources if given.reversal is not None else given.rows).shape[0]
             kind = _kind_of(given, cuda)._replace(apart=apart, mirrored=mirrored)
+            kind = kind._replace(lanes=kept.lanes_of_sums(rows)) if cuda else kind
             kind = kind._replace(kind=summed.of(kind.kind))
             results = SumsOf(term, kind.kind, rows, kept.slots(rows, kind.lanes))
             operands = _operands(given, kind, term.columns, others)
@@ -147,7 +148,7 @@ def _kind_of(given: KeptList, cuda: bool) -> ListKind:
         reversed=is_reversed,
         aligned=given.idx.shape[1] % 4 == 0,
         ordered=given.order is not None and cuda,
-        lanes=kept.lanes_of(given.rows.shape[0]) if cuda else 0,
+        lanes=kept.LANES if cuda else 0,
         boxes=given.systems is not None,
         itself=isinstance(cutoff, Cutoffs) and cutoff.itself,
     )
