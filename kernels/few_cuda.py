@@ -8,7 +8,6 @@ import functools
 
 from jfrnn.kernels._native import Kind, declare_kind
 from jfrnn.kernels._program import Entry, Kernel
-from jfrnn.kernels.cells_cuda import GRID
 from jfrnn.kernels.pair_sum_cpu import TermText, constants_of, term_header
 
 MOST = 4096  # sources, and queries, up to which all of them meet
@@ -52,7 +51,7 @@ def rows_kernel(kind: Kind, warps: int) -> Kernel:
 @functools.lru_cache(512)
 def sum_kernel(kind: Kind, warps: int, term: TermText, key: str) -> Kernel:
     """Return the kernel that sums a term, for warps of a block, as `jfrnn.kernels.pair_sum_cuda.sum_kernels` does."""
-    constants, given = {**GRID, "LIST": 0, **_sizes(warps), **constants_of(term, kind)}, term_header(term, kind.double)
+    constants, given = {"LIST": 0, **_sizes(warps), **constants_of(term, kind)}, term_header(term, kind.double)
     name, entry = f"few_sums_cuda_{key}_{warps}w", Entry("FewSums.run", 32 * warps)
     return declare_kind(kind.compiled(), name, "few_sums.cuh", entry, cuda=True, given=given, constants=constants)[0]
 

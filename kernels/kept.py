@@ -14,7 +14,6 @@ from typing import NamedTuple
 
 from jfrnn.kernels._native import Kind, program
 from jfrnn.kernels._program import Entry, Kernel, declare
-from jfrnn.kernels.cells_cuda import GRID
 from jfrnn.kernels.pair_sum_cpu import TermText, constants_of, term_header
 
 ROWS_AT_ONCE = 64  # that a thread of the CPU takes
@@ -89,7 +88,7 @@ class ListKind(NamedTuple):
         found = {"CODE_BYTES": self.code_bytes, "REVERSED": self.reversed, "ALIGNED": self.aligned, "ORDERED": self.ordered}
         found |= {"DECIDED": 1, "MEASURED": self.measured, "APART": self.apart, "MIRRORED": self.mirrored, "OWN": 0}
         found |= {"BOXES": self.boxes, "ITSELF": self.itself, "LENGTH": self.length(columns)}
-        return found | {"LANES_PER_ROW": max(self.lanes, 1), "QUERY_CHUNK": ROWS_AT_ONCE, **GRID}
+        return found | {"LANES_PER_ROW": max(self.lanes, 1), "QUERY_CHUNK": ROWS_AT_ONCE}
 
 
 def lanes_of_sums(rows: int) -> int:

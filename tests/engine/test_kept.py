@@ -9,6 +9,7 @@ from itertools import product
 import by_numpy
 import jax
 import jax.numpy as jnp
+import kept_scenes
 import numpy as np
 import pytest
 import reference
@@ -259,23 +260,18 @@ def test_in_two_dimensions_and_single_precision():
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 @pytest.mark.parametrize("side", [2.06, 2.4])
 def test_in_a_box_as_narrow_as_it_may_be(side, dtype):
-    """Pairs whose nearest image is another one stand hardly farther apart than those whose is not; few, so that all go one way."""
-    rng, box = np.random.default_rng(5), jfrnn.Box(np.full(2, side, dtype))
-    x = jnp.asarray(rng.uniform(0, side, (4, 2)), dtype)
-    nbrs = jfrnn.search(x, 0.98, skin=0.02, box=box, capacity=4)
-    assert nbrs.images is None
-    of_list = jax.jit(
-        lambda nbrs, x: (jfrnn.pair_sum(lambda r, i, j: jnp.append(r, 1), x, None, neighbors=nbrs), nbrs.distances(x))
-    )
-    for _ in range(60):
-        x = jnp.asarray(rng.uniform(0, side, (4, 2)), dtype)
-        found, (distances, mask) = of_list(nbrs.update(x), x)
-        r = np.asarray(x, float)[None] - np.asarray(x, float)[:, None]
-        r -= side * np.round(r / side)
-        near = ((r**2).sum(2) < dtype(0.98) ** 2) & ~np.eye(4, dtype=bool)
-        np.testing.assert_allclose(found, (near[..., None] * np.append(r, np.ones((4, 4, 1)), 2)).sum(1), atol=1e-6)
-        np.testing.assert_array_equal(np.sum(mask, axis=1), near.sum(1))
-        np.testing.assert_allclose(np.sum(distances), np.sqrt((r**2).sum(2))[near].sum(), rtol=1e-6)
+    kept_scenes.narrow_box(side, dtype)
+
+
+@pytest.mark.parametrize("most", [1, 5, 700])
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_pairs_whose_points_lie_boxes_apart(dtype, most):
+    kept_scenes.boxes_apart(dtype, most)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_ties_beside_pairs_that_a_wide_box_leaves_in_doubt(dtype):
+    kept_scenes.ties_in_a_wide_box(dtype)
 
 
 def test_the_kernel_sums():

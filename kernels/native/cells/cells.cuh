@@ -29,7 +29,6 @@ struct alignas(4 * sizeof(real)) Place {
     real id;
 };  // id: the bits of an int
 static_assert(sizeof(Shared) <= 4 * 64, "the head of a scratch");
-constexpr unsigned int ALL = 0xffffffffu;
 
 // What a thread is: its number in its warp, the number of its warp in the block, the number of its block, and its number among all.
 struct Thread {

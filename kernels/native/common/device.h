@@ -10,6 +10,7 @@
 #define JFRNN_MATH static __device__ __forceinline__
 #define JFRNN_TABLE static __device__ constexpr
 #define JFRNN_CONTRACTED
+constexpr unsigned int ALL = 0xffffffffu;  // lanes of a warp
 static __device__ __forceinline__ long long thread_index() { return (long long)blockIdx.x * blockDim.x + threadIdx.x; }
 #else
 #pragma clang fp contract(off)

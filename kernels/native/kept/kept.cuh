@@ -78,8 +78,7 @@ struct KeptLane : Kept {
                 load_numbers<LENGTH>(points + (long long)LENGTH * some.ids[k], numbers[k]);
             Entries next;
             read(first, place + AT_A_TIME * LANES_PER_ROW, all, next);
-            unsigned int pairs = 0;
-            bool open = false;
+            bool open = false, sure[AT_A_TIME];
             real lengths[AT_A_TIME];
             auto judge_all = [&](auto home) {
 #pragma unroll
@@ -87,7 +86,7 @@ struct KeptLane : Kept {
                     const Verdict verdict = judged<home.value>(own, numbers[k], some.ids[k], some.codes[k]);
                     lengths[k] = MEASURED ? length_of(verdict.vector) : real(0);
                     open |= verdict.open;
-                    pairs |= verdict.sure ? 1u << k : 0;
+                    sure[k] = verdict.sure;
                     visit(home, place + k, some.ids[k], numbers[k], verdict, verdict.sure);
                 }
             };
@@ -103,21 +102,31 @@ struct KeptLane : Kept {
                 judge_all(Home<false>());
             else if constexpr (NEAREST)
                 judge_all(Home<true>());
+            unsigned int pairs = 0;
+            auto put_down = [&] {
+#pragma unroll
+                for (int k = 0; k < AT_A_TIME; ++k)
+                    pairs |= sure[k] ? 1u << k : 0;
+            };
             if (open) {  // what comes next is read again: it would leave its registers for calls that hardly ever happen
+                put_down();
 #pragma unroll 1
                 for (int k = 0; k < AT_A_TIME && place + k < all; ++k) {
+                    if (pairs >> k & 1)
+                        continue;
                     int id, code;
                     read_entry(first + place + k, id, code);
                     real doubted[LENGTH];
                     load_numbers<LENGTH>(points + (long long)LENGTH * id, doubted);
                     const Verdict verdict = judged<false>(own, doubted, id, code);
-                    if (verdict.open && decide(own, doubted, verdict)) {
+                    if (verdict.sure || (verdict.open && decide(own, doubted, verdict))) {
                         pairs |= 1u << k;
                         visit(Home<false>(), place + k, id, doubted, verdict, true);
                     }
                 }
                 read(first, place + AT_A_TIME * LANES_PER_ROW, all, next);
-            }
+            } else
+                put_down();
             settle(place, pairs, lengths);
             some = next;
         }

@@ -1,6 +1,6 @@
 // What becomes of the summands of a query on CUDA: they are added up, or the largest ones are found.
 #pragma once
-#include "cells.cuh"
+#include "device.h"
 #include "reduction.h"
 
 // Where sums go: rows of queries, and of sums over all pairs two numbers per block of shares: a part, and what rounding took of it.
