@@ -8,7 +8,7 @@ that the search has left.
 """
 
 import functools
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -17,6 +17,7 @@ from jfrnn.kernels._program import Entry, Kernel, declare
 from jfrnn.kernels.pair_sum_cpu import TermText, constants_of, term_header
 
 ROWS_AT_ONCE = 64  # that a thread of the CPU takes
+BLOCKS_OF_ROWS = 8  # whose derivatives are summed by themselves on the CPU
 LANES = 8  # of CUDA that serve a row
 _MANY = 1 << 15  # rows
 _BLOCK = 128
@@ -109,13 +110,17 @@ def threads(rows: int, lanes: int) -> int:
 @functools.lru_cache(256)
 def mask_kernel(kind: ListKind) -> Kernel:
     """Return the kernel that tells which slots hold a pair now, and the distances if these are measured."""
-    return _kernel(kind, "mask", {"OTHERS": 0, "SUMS": 0, "LIST": 0, **kind.constants(0)})
+    return _kernels(kind, "mask", ["run"], {"OTHERS": 0, "SUMS": 0, "LIST": 0, **kind.constants(0)})[0]
 
 
 @functools.lru_cache(256)
-def slope_kernel(kind: ListKind) -> Kernel:
-    """Return the kernel that makes derivatives by positions of those by distances, in a list that is its own mirror image."""
-    return _kernel(kind, "slopes", {"OTHERS": 0, "SUMS": 0, "LIST": 0, **kind.constants(0), "DECIDED": 0})
+def slope_kernels(kind: ListKind) -> list[Kernel]:
+    """Return the kernels that make derivatives by positions of those by distances, in a list that is its own mirror image.
+
+    On CUDA there is one, which reads reverse slots; on the CPU two, of which the second adds up what blocks of rows have summed.
+    """
+    constants = {"OTHERS": 0, "SUMS": 0, "LIST": 0, **kind.constants(0), "DECIDED": 0, "BLOCKS": BLOCKS_OF_ROWS}
+    return _kernels(kind, "slopes", ["run"] if kind.cuda else ["run", "add"], constants)
 
 
 @functools.lru_cache(512)
@@ -125,12 +130,18 @@ def sum_kernel(kind: ListKind, term: TermText, key: str) -> Kernel:
     For extremes, `errors` [m, width, 2] gets the sources of the largest summands (n: there is none), and their places in the row.
     """
     constants = {"LIST": 0, **kind.constants(term.columns), **constants_of(term, kind.kind, turned=False)}
-    return _kernel(kind, "sums", constants, term_header(term, kind.kind.double, turned=False), f"_{key}")
+    return _kernels(kind, "sums", ["run"], constants, term_header(term, kind.kind.double, turned=False), f"_{key}")[0]
 
 
-def _kernel(
-    kind: ListKind, what: str, constants: Mapping[str, int], given: Mapping[str, str] = MappingProxyType({}), key: str = ""
-) -> Kernel:
+def _kernels(
+    kind: ListKind,
+    what: str,
+    methods: Sequence[str],
+    constants: Mapping[str, int],
+    given: Mapping[str, str] = MappingProxyType({}),
+    key: str = "",
+) -> list[Kernel]:
     text = program(kind.kind, f"kept_{what}.cuh" if kind.cuda else f"kept_{what}_cpu.h", constants=constants, given=given)
-    entry = Entry(f"Kept{what.title()}.run", _BLOCK if kind.cuda else 1, _BLOCKS_IN_BOX if kind.kind.periodic else _BLOCKS)
-    return declare(f"kept_{what}_{kind.name}{key}", text, entry, cuda=kind.cuda, fused=kind.cuda)[0]
+    block, blocks = _BLOCK if kind.cuda else 1, _BLOCKS_IN_BOX if kind.kind.periodic else _BLOCKS
+    entries = [Entry(f"Kept{what.title()}.{method}", block, blocks) for method in methods]
+    return declare(f"kept_{what}_{kind.name}{key}", text, *entries, cuda=kind.cuda, fused=kind.cuda)

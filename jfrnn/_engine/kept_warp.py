@@ -85,21 +85,17 @@ def _measure(given: KeptList, cuda: bool, measured: bool) -> dict[str, Array]:
     return dict(zip(dims, _mask_callable(kind)(*_operands(given, kind, 0, None), output_dims=dims), strict=True))
 
 
-def kept_slopes(given: KeptList, slots: Array, distances: Array, slopes: Array) -> Array:
+def kept_slopes(given: KeptList, slots: Array | None, distances: Array, slopes: Array) -> Array:
     """Return the derivatives by positions [n, d] of a function whose derivatives by distances are `slopes` [n, capacity].
 
-    The list is its own mirror image, `slots` are its reverse slots, and distances those of `kept_distances`.
+    The list is its own mirror image, and distances are those of `kept_distances`. `slots` are its reverse slots, on CUDA; on the
+    CPU, None.
     """
-
-    def on(cuda: bool) -> Callable[..., Array]:
-        def call(given: KeptList, slots: Array, distances: Array, slopes: Array) -> Array:
-            kind, dims = _kind_of(given, cuda), {"sums": given.sources.shape, "info": 2}
-            operands = _operands(given, kind, 0, None, slots)
-            return _slope_callable(kind)(*operands, distances, slopes, output_dims=dims)[0]
-
-        return call
-
-    return on_platform(given, slots, distances, slopes, cpu=on(False), cuda=on(True))
+    kind, dims = _kind_of(given, slots is not None), {"sums": given.sources.shape, "parts": 1, "info": 2}
+    if slots is None:
+        dims["parts"] = 4 * kept.BLOCKS_OF_ROWS * given.sources.shape[0]
+    operands = _operands(given, kind, 0, None, slots)
+    return _slope_callable(kind)(*operands, distances, slopes, output_dims=dims)[0]
 
 
 def kept_sums(given: KeptList, summed: Summed, values: tuple[Array, Array | None, Array], apart: bool = False) -> FoundSums:
@@ -227,7 +223,7 @@ def _mask_callable(kind: ListKind) -> Call:
 
 @kernel
 def _slope_callable(kind: ListKind) -> Call:
-    results = {"sums": scalar_of(kind.kind), "info": np.int32}
+    results = dict.fromkeys(("sums", "parts"), scalar_of(kind.kind)) | {"info": np.int32}
     plan = functools.partial(_plan_slopes, kind)
     return Call(f"jfrnn_kept_slopes_{kind.call}", (*_LIST, "distances", "slopes"), results, plan)
 
@@ -256,7 +252,13 @@ def _plan_mask(kind: ListKind, shapes: Shapes, _: int) -> Plan:
 
 
 def _plan_slopes(kind: ListKind, shapes: Shapes, _: int) -> Plan:
-    return _launch(kind, kept.slope_kernel(kind), shapes)
+    found, *more = kept.slope_kernels(kind)
+    plan = _launch(kind, found, shapes)
+    if kind.cuda:
+        return plan._replace(absent=["parts"])
+    blocks, n = kept.BLOCKS_OF_ROWS, shapes["sums"][0]
+    steps = [Clear("info", 8), share(found, blocks, max(1, blocks * kept.ROWS_AT_ONCE // n)), *(share(each, n) for each in more)]
+    return plan._replace(steps=steps, absent=["slots"])
 
 
 def _plan_sums(kind: ListKind, term: TermText, key: str, shapes: Shapes, _: int) -> Plan:

@@ -117,11 +117,15 @@ def _decode(value: Static) -> Static:
 @functools.cache
 def _sources() -> str:
     """Return a name of the sources that decide what a kernel is given, so that it is never given what was made for another."""
-    texts = []
-    for folder in (Path(str(files(package))) for package in ("jfrnn", "jfrnn.kernels")):  # packages beneath count by themselves
-        found = (path for path in sorted(folder.rglob("*")) if path.suffix in (".py", ".h", ".cuh"))
-        texts += [path.read_bytes() for path in found if path.relative_to(folder).parts[0] not in ("cases", "kernels")]
-    return hashlib.sha256(b"".join(texts)).hexdigest()[:12]
+    found = hashlib.sha256()
+    for package, others in (("jfrnn", ("cases", "kernels", "sph")), ("jfrnn.kernels", ())):
+        root = str(files(package))
+        for folder, inner, names in os.walk(root):
+            inner[:] = sorted(name for name in inner if folder != root or name not in others)
+            for name in sorted(names):
+                if name.endswith((".py", ".h", ".cuh")):
+                    found.update(Path(folder, name).read_bytes())
+    return found.hexdigest()[:12]
 
 
 def _read_call(name: str, recipe: str) -> tuple[Call, Shapes]:

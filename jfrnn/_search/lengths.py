@@ -1,7 +1,8 @@
-"""Distances of a list that is its own mirror image, by Warp's kernels, with derivatives by kernels that gather.
+"""Distances of a list that is its own mirror image, by Warp's kernels, with derivatives by kernels.
 
-A pair gives the opposite to j of what it gives to i. So derivatives by positions need two numbers of each slot: its slope and that
-of its reverse slot. Neither displacements nor what belongs to them is stored.
+A pair gives the opposite to j of what it gives to i. So on CUDA, derivatives by positions need two numbers of each slot: its slope
+and that of its reverse slot. On the CPU, where several blocks of rows have sums of their own, each pair gives to both ends at once.
+Neither displacements nor what belongs to them is stored.
 """
 
 import dataclasses
@@ -19,7 +20,7 @@ from jfrnn._geometry import Box, bring_near, translation
 from jfrnn._search.gathers import bind, collect, define, gather
 from jfrnn._search.geometry import kept_list, kept_shifts, norms, vectors_of
 from jfrnn._search.present import Present, Topology
-from jfrnn._tracing import call_apart, compile_program
+from jfrnn._tracing import call_apart, compile_program, on_platform
 
 _Lines = tuple[KeptList, Topology, Array]  # a list at present positions, and its distances, 0 where there is no pair
 
@@ -86,8 +87,15 @@ def _pull(slopes: Array, lines: _Lines) -> Array:
 
 
 def _pull_by_kernel(slopes: Array, lines: _Lines) -> Array:
-    kept, topology, distances = lines
-    return kept_slopes(kept, topology.with_reverse().slots, distances, slopes)
+    def on_cpu(slopes: Array, lines: _Lines) -> Array:
+        kept, _, distances = lines
+        return kept_slopes(kept, None, distances, slopes)
+
+    def on_cuda(slopes: Array, lines: _Lines) -> Array:
+        kept, topology, distances = lines
+        return kept_slopes(kept, topology.with_reverse().slots, distances, slopes)
+
+    return on_platform(slopes, lines, cpu=on_cpu, cuda=on_cuda)
 
 
 _along_p, _pull_p = Primitive("jfrnn_along"), Primitive("jfrnn_pull")

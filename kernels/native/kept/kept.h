@@ -28,7 +28,7 @@ struct MaskArguments : KeptArguments {
 };
 struct KeptSlopesArguments : KeptArguments {
     const real *distances, *slopes;
-    real* sums;
+    real *sums, *parts;
     int* info;
 };
 struct KeptSumsArguments : KeptArguments {
@@ -51,8 +51,9 @@ constexpr bool CODED = PERIODIC == 2;
 constexpr int TURNS = DIM + OTHERS, RADIUS = TURNS + (CODED ? DIM : 0);  // where they stand among the numbers of a source
 constexpr int OWN_TURNS = DIM, OWN_RADIUS = OWN_TURNS + (CODED ? DIM : 0), OWN_LENGTH = OWN_RADIUS + DIFFER;
 
-// Derivatives by positions (KeptSlopes): each slot has the slope of a function by its distance, and in `slots` the slot of the pair the
-// other way round: what both give to the row is along x_j - x_i. Distances below this, whose reciprocal is no float, give nothing.
+// Derivatives by positions (KeptSlopes): each slot has the slope of a function by its distance, and (CUDA) in `slots` the slot of the
+// pair the other way round: what both give to the row is along x_j - x_i. Distances below this, whose reciprocal is no float, give
+// nothing.
 constexpr real LEAST_DISTANCE = DOUBLE ? real(0x1p-1022) : real(0x1p-126f);
 
 struct Kept : KeptArguments, Space {
