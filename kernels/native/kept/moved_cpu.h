@@ -5,9 +5,9 @@
 #include "motion.h"
 
 struct MovedArguments {
-    const real *now, *limit, *cutoff, *reference;                      // [n, DIM], [1], the lattice, [n, DIM]
-    const real *vectors, *origin, *vectors_of_then, *origin_of_then;   // [DIM] of the box
-    int *moved, *info;                                                 // written: [1]; scratch, of 0
+    const real *now, *limit, *cutoff, *reference;                     // [n, DIM], [1], the lattice, [n, DIM]
+    const real *vectors, *origin, *vectors_of_then, *origin_of_then;  // [DIM] of the box
+    int *moved, *info;                                                // written: [1]; scratch, of 0
     int n;
 };
 
