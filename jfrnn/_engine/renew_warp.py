@@ -31,6 +31,7 @@ from jfrnn._geometry import (
     Status,
     bound_wrapping,
     is_valid,
+    make_cutoff,
     make_lattice,
     sides_of,
 )
@@ -87,20 +88,23 @@ def find_box_numbers(inputs: Inputs, cutoff: np.floating | Array, options: Optio
     return BoxNumbers(numbers_of_box(inputs, options), numbers_of_pairs(cutoff, lattice), sides_of(lattice))
 
 
-def can_ask(inputs: Inputs, options: Options, platform: str) -> bool:
+def can_ask(inputs: Inputs, options: Options, skin: float, platform: str) -> bool:
     """Say whether a kernel may tell that a list is stale: of all particles, with one cutoff, in open space or an upright box."""
     images, cutoff = options.images, inputs.cutoff
     plain = options.engine.native and isinstance(cutoff, Cutoff) and not cutoff.scaled
     alone = inputs.queries is None and inputs.active is None
     boxed = images is None or (images.orthogonal and not images.per_system)
-    return plain and alone and boxed and inputs.sources.shape[0] > 0 and PLATFORMS.get(platform_of(inputs.sources)) == platform
+    # kernels compare squares of motions as they are: those of a very short skin, or a very long one, are compared in another unit
+    moderate = not make_cutoff(skin / 2, np.dtype(inputs.sources.dtype), closed=False).scaled
+    here = inputs.sources.shape[0] > 0 and PLATFORMS.get(platform_of(inputs.sources)) == platform
+    return plain and moderate and alone and boxed and here
 
 
-def can_renew(inputs: Inputs, options: Options, capacity: int) -> bool:
+def can_renew(inputs: Inputs, options: Options, skin: float, capacity: int) -> bool:
     """Say whether such a list renews itself, on CUDA: then none of its pairs has several images."""
     images, alone = options.images, inputs.batch is None and inputs.exclude is None
     boxed = images is None or (images.nearest and not images.counts_short)
-    return can_ask(inputs, options, "cuda") and alone and boxed and capacity > 0 and inputs.sources.shape[0] < MOST_IN_BOX
+    return can_ask(inputs, options, skin, "cuda") and alone and boxed and capacity > 0 and inputs.sources.shape[0] < MOST_IN_BOX
 
 
 def has_moved(inputs: Inputs, options: Options, reference: Array, of_then: Box | None, limit: np.floating | Array) -> Array:

@@ -347,7 +347,7 @@ def _make_again_if_stale(nbrs: Kept, inputs: Inputs, stays: bool = False) -> Kep
     assert nbrs.verlet is not None
     box = inputs.box
     radii = inputs.cutoff if isinstance(inputs.cutoff, geometry.Radii) else None
-    if stays and can_ask(inputs, nbrs.problem.options, "cpu"):
+    if stays and can_ask(inputs, nbrs.problem.options, nbrs.skin, "cpu"):
         moved = on_platform(nbrs, inputs, cpu=_kernel_says_so, default=_has_moved_too_far)
     else:
         moved = _has_moved_too_far(nbrs, inputs)

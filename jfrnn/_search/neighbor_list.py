@@ -339,7 +339,7 @@ class NeighborList(KeptSearch):
 
     def _may_renew(self, inputs: Inputs) -> bool:
         plain = self.reverse is None and self.images is None
-        return plain and can_renew(inputs, self.problem.options, self.capacity)
+        return plain and can_renew(inputs, self.problem.options, self.skin, self.capacity)
 
     def _find_box_numbers(self, inputs: Inputs) -> BoxNumbers | None:
         there = self.box_numbers is not None  # then they stay, wherever the list has gone since

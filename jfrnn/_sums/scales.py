@@ -8,6 +8,8 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
+import numpy as np
+
 from jfrnn._sums.scalars import Number, Scalars
 
 _MOST_FACTORS = 16  # of a product that is looked at as a whole
@@ -22,7 +24,10 @@ class _Multiple(NamedTuple):
 
 
 def collect_scales(scalars: Scalars, outputs: Iterable[int]) -> dict[int, int]:
-    """Return for each output a scalar of the same value, up to where numbers leave the range of floats."""
+    """Return for each output a scalar of the same value, up to the sign of 0, and where numbers leave the range of floats.
+
+    Constants never do: one that would is not scaled.
+    """
     outputs = list(outputs)
     work = _Scales(scalars)
     for number in sorted(scalars.dependencies(outputs)):
@@ -83,8 +88,8 @@ class _Scales:
         if each.factor == 1:
             return each.number
         dtype, value = self.scalars.nodes[each.number].dtype, self.scalars.value(each.number)
-        if value is not None:
-            return self.scalars.constant(value * value.dtype.type(each.factor), dtype)
+        if value is not None and (scaled := self._scaled(each)) is not None:
+            return scaled
         factors = self._factors(each) if uses else ()
         if factors and uses:
             one, other = sorted(factors, key=lambda x: uses[x])
@@ -93,11 +98,20 @@ class _Scales:
             return self.scalars.apply("neg", [each.number], dtype)
         return self.scalars.apply("mul", [each.number, self.scalars.constant(each.factor, dtype)], dtype)
 
+    def _scaled(self, each: _Multiple) -> int | None:
+        """Return the constant that a multiple of one is; None for what is none, or would be no normal number any longer."""
+        value = self.scalars.value(each.number)
+        if value is None:
+            return None
+        exact, limits = float(value) * each.factor, np.finfo(value.dtype)
+        stays = not np.isfinite(value) or value == 0 or float(limits.tiny) <= abs(exact) <= float(limits.max)
+        return self.scalars.constant(exact, self.scalars.nodes[each.number].dtype) if stays else None
+
     def _product(self, a: _Multiple, b: _Multiple, dtype: str) -> _Multiple:
         factor = a.factor * b.factor
         for one, other in ((a, b), (b, a)):
             value = self.scalars.value(one.number)
-            if _is_scale(value):
+            if _is_scale(value) and 1 / _MOST <= abs(factor * float(value)) <= _MOST:
                 return _Multiple(other.number, factor * float(value))
             if value is not None and value < 0:
                 positive = self.scalars.constant(-value, dtype)
@@ -111,19 +125,21 @@ class _Scales:
 
     def _alike(self, a: _Multiple, b: _Multiple, dtype: str) -> tuple[list[int], float]:
         """Return scalars of which both parts are the same multiple, and that."""
-        if self.scalars.value(b.number) is not None:
-            return [a.number, self._whole(_Multiple(b.number, b.factor / a.factor))], a.factor
-        if self.scalars.value(a.number) is not None:
-            return [self._whole(_Multiple(a.number, a.factor / b.factor)), b.number], b.factor
+        if (constant := self._scaled(_Multiple(b.number, b.factor / a.factor))) is not None:
+            return [a.number, constant], a.factor
+        if (constant := self._scaled(_Multiple(a.number, a.factor / b.factor))) is not None:
+            return [constant, b.number], b.factor
         return ([a.number, b.number], a.factor) if a.factor == b.factor else ([self._whole(a), self._whole(b)], 1)
 
     def _sum(self, a: _Multiple, b: _Multiple, dtype: str) -> _Multiple:
         for one, other in ((a, b), (b, a)):
-            if self.scalars.value(one.number) is not None:
-                factor = abs(other.factor)
-                constant = self._whole(_Multiple(one.number, one.factor / factor))
+            factor = abs(other.factor)
+            constant = self._scaled(_Multiple(one.number, one.factor / factor))
+            if constant is not None:
                 return _Multiple(self.scalars.apply("add" if other.factor > 0 else "sub", [constant, other.number], dtype), factor)
-        a, b = sorted((a, b), key=lambda each: (abs(each.factor), -each.factor))
+            if self.scalars.value(one.number) is not None:
+                return _Multiple(self.scalars.apply("add", [self._whole(one), self._whole(other)], dtype), 1)
+        a, b = sorted((a, b), key=lambda each: (-abs(each.factor), -each.factor))  # so that nothing grows
         ratio = b.factor / a.factor
         if ratio == -1 and self.scalars.find("sub", (b.number, a.number), dtype) is not None:  # what is known already
             a, b = b, a

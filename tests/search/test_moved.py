@@ -77,6 +77,21 @@ def test_points_that_are_not_finite_move_when_they_become_finite(dim, dtype):
     assert answers(nbrs, x) == [True, True]
 
 
+@pytest.mark.parametrize("skin", [1e-9, 1e-20, 2.0**32])
+@pytest.mark.parametrize("box", ["open", "box"])
+def test_skins_whose_squares_are_no_floats_that_kernels_compare(skin, box):
+    """Array programs compare them in another unit, and are asked."""
+    x = np.asarray([[0, 0, 0], [1.25, 0, 0]], np.float32)
+    length = LENGTH * max(1, skin)
+    nbrs = jfrnn.search(
+        jnp.asarray(x), CUTOFF, skin=skin, box=jfrnn.Box(np.full(3, length, np.float32)) if box == "box" else None, capacity=2
+    )
+    x[1, 0] = 0.5
+    after = nbrs.update(jnp.asarray(x))
+    assert int(after.rebuild_count) == (skin < 1)
+    assert int(after.distances(jnp.asarray(x))[1].sum()) == 2
+
+
 def test_a_box_that_has_changed_since_makes_a_list_stale():
     """The box of a list may be another one than that in which it was made; by the kernel, any other makes it stale."""
     x = points(200, 3, np.float32, seed=3)

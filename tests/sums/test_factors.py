@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import jfrnn
 from jfrnn._sums.factors import factor_out
 from jfrnn._sums.translate import translate_scalars
 
@@ -65,6 +66,32 @@ def test_values_stay_and_operations_go(name):
     for is_better, numbers in ((False, outputs), (True, better.values())):
         count[is_better] = sum(bool(scalars.nodes[k].operands) for k in scalars.dependencies(numbers))
     assert count[True] <= min(count[False], most), count
+
+
+LARGEST, LEAST = (float(x) for x in (np.finfo(np.float32).max, np.finfo(np.float32).tiny))
+AT_THE_ENDS = {
+    "a guard": lambda x: 1 / (2 * (x[0] * x[1]) * (x[0] + x[2]) * 2 + LEAST),
+    "a smaller guard": lambda x: 1 / (2 * x[0] * x[2] * 2 * x[1] + LEAST),
+    "a mask": lambda x: 0.5 * jnp.where(x[0] > 10, 0.5 * (x[0] * 0.5) * x[1] * 0.5, LARGEST),
+    "a mask behind": lambda x: jnp.where(x[0] > 10, 0.5 * x[0] * (0.5 * x[1]), LARGEST) * 0.5,
+    "a root": lambda x: jnp.sqrt(jnp.where(x[0] > 10, 0.5 * x[0] * x[1], LARGEST) * 0.5 * -1 * -1),
+    "a power": lambda x: (x[0] * -8) * (x[1] * -8) * 1e-30 * 2.0**127 * 2.0**-100 * -1,
+    "a sum with the largest": lambda x: (LARGEST - 4 * x[0]) * 0.5 + (x[1] * 0.25 - LEAST),
+}
+
+
+@pytest.mark.parametrize("name", AT_THE_ENDS)
+@pytest.mark.filterwarnings("error")
+def test_constants_stay_in_the_range_of_floats(name):
+    """Masks and guards have the largest float, or the least: twice or half of it is none."""
+    function = AT_THE_ENDS[name]
+    scalars, _, (results,) = translate_scalars(jax.make_jaxpr(lambda x: jnp.reshape(function(x), 1))(jnp.ones(3, jnp.float32)))
+    better = factor_out(scalars, results.tolist())
+    x = jnp.asarray([[0, 0, 0], [0.25, 0, 0.5]], jnp.float32)
+    constants = [scalars.value(k) for k in scalars.dependencies(better.values()) if scalars.value(k) is not None]
+    assert all(value == 0 or LEAST <= abs(float(value)) <= LARGEST for value in constants), constants
+    found, expected = (jfrnn.pair_sum(lambda r, i, j: function(r), x, 1.0, backend=backend) for backend in ("warp", "jax"))
+    np.testing.assert_allclose(found, expected, rtol=1e-6)
 
 
 @pytest.mark.parametrize("factor", [1, 3])
