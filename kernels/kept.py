@@ -119,7 +119,7 @@ def slope_kernels(kind: ListKind) -> list[Kernel]:
 
     On CUDA there is one, which reads reverse slots; on the CPU two, of which the second adds up what blocks of rows have summed.
     """
-    constants = {"OTHERS": 0, "SUMS": 0, "LIST": 0, **kind.constants(0), "DECIDED": 0, "BLOCKS": BLOCKS_OF_ROWS}
+    constants = {"OTHERS": 0, "SUMS": 0, "LIST": 0, **kind.constants(0), "DECIDED": 0, "ROW_BLOCKS": BLOCKS_OF_ROWS}
     return _kernels(kind, "slopes", ["run"] if kind.cuda else ["run", "add"], constants)
 
 

@@ -237,7 +237,6 @@ def _evaluation(term: TermText, double: bool, turned: bool, apart: bool) -> list
     """Return the lines that evaluate a term for a vector of pairs; `apart`: in two ways, of which one, AT_HOME, is for S = 0."""
     lines = ["template <bool AT_HOME, class Column>" if apart else "template <class Column>"]
     lines += ["JFRNN_MEMBER void evaluate(const Own& own, const number* p, Column column, number* summand) const {"]
-    lines += ["JFRNN_CONTRACTED"]
     lines += [f"const Math::{_NAMES[value.dtype]} {value.name} = own.{value.name};" for value in term.own]
     numbers = place_values(term.others, "column({})", "p[{}]")
     lines += [load_value(value, x, f"Math::bits({x})", double) for value, x in zip(term.others, numbers, strict=True)]

@@ -57,6 +57,7 @@ constexpr int LANES_PER_ROW = 8;  // of CUDA
 constexpr bool DECIDED = true;    // which of its slots hold a pair
 constexpr bool MIRRORED = false;  // a term reads of i what it reads of j
 constexpr bool MEASURED = false;  // distances are written, too
+constexpr int ROW_BLOCKS = 8;     // of rows whose derivatives are summed by themselves, on the CPU
 constexpr bool BOXES = false;     // each system has a lattice of its own
 // Lists that renew themselves (see jfrnn/kernels/renew.py): bits of a status, which points are far and what is met of turns, and
 // where the order of sources stands in a scratch.

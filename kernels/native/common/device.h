@@ -9,13 +9,10 @@
 #define JFRNN_CALL static __device__ __noinline__
 #define JFRNN_MATH static __device__ __forceinline__
 #define JFRNN_TABLE static __device__ constexpr
-#define JFRNN_CONTRACTED
 constexpr unsigned int ALL = 0xffffffffu;  // lanes of a warp
 static __device__ __forceinline__ long long thread_index() { return (long long)blockIdx.x * blockDim.x + threadIdx.x; }
 #else
 #pragma clang fp contract(off)
-// At the beginning of a block whose products may be contracted with sums, as on CUDA; elsewhere exact arithmetic relies on roundings.
-#define JFRNN_CONTRACTED _Pragma("clang fp contract(fast)")
 #define JFRNN_FUNCTION static
 #define JFRNN_MEMBER
 #define JFRNN_INLINE __attribute__((always_inline))

@@ -188,7 +188,6 @@ struct Kept : KeptArguments, Space {
             return found;
         }
         for (int k = 0; k < DIM; ++k) {  // as terms add squares, so that they are taken once
-            JFRNN_CONTRACTED
             const Number scaled = d[k] * scale();
             square = k > 0 ? square + scaled * scaled : scaled * scaled;
         }

@@ -1,6 +1,6 @@
 // What distances of a list give to the derivatives of positions, on the CPU.
 //
-// What a pair gives to j is added where j stands, so that nobody looks for the pair the other way round. Rows are taken in BLOCKS,
+// What a pair gives to j is added where j stands, so that nobody looks for the pair the other way round. Rows are taken in ROW_BLOCKS,
 // each of which has sums of its own, in [n, 4] of `parts`: the result is the same whichever thread takes a block.
 #pragma once
 #include "kept_cpu.h"
@@ -15,7 +15,7 @@ struct KeptSlopes : KeptRows<KeptSlopes> {
     void run() {
         if constexpr (FLUSHED)
             floats.flush();
-        each_chunk(next[0], BLOCKS, 1, [&](int block, int, int) {
+        each_chunk(next[0], ROW_BLOCKS, 1, [&](int block, int, int) {
             real* const part = parts + 4ll * n * block;
             memset(part, 0, sizeof(real) * 4 * n);
             for (int row = first_of(block); row < first_of(block + 1); ++row) {
@@ -24,7 +24,7 @@ struct KeptSlopes : KeptRows<KeptSlopes> {
             }
         });
     }
-    int first_of(int block) const { return (int)((long long)m * block / BLOCKS); }
+    int first_of(int block) const { return (int)((long long)m * block / ROW_BLOCKS); }
     // Adds what the pairs of a row give to it and to its neighbors. Distances below LEAST_DISTANCE, as of unused slots, give nothing.
     JFRNN_INLINE void serve(int row, const OwnPoint& own, real* part) const {
         const long long first = (long long)row * capacity;
@@ -67,7 +67,7 @@ struct KeptSlopes : KeptRows<KeptSlopes> {
             for (int i = from; i < to; ++i)
                 for (int k = 0; k < DIM; ++k) {
                     real total = 0;
-                    for (int block = 0; block < BLOCKS; ++block)
+                    for (int block = 0; block < ROW_BLOCKS; ++block)
                         total += parts[4ll * n * block + 4ll * i + k];
                     sums[(long long)DIM * i + k] = total;
                 }
