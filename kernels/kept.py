@@ -1,7 +1,7 @@
 """Lists that are kept: which slots hold a pair now, their distances and what these give to derivatives, and sums over the pairs.
 
 On the CPU, LANES slots of a row are taken at a time. Numbers of their sources are read four at a time, where these stand, and rows
-and columns of what was read are exchanged in registers. On CUDA, two or eight lanes serve a row. A lane
+and columns of what was read are exchanged in registers. On CUDA, eight lanes serve a row, or two where many rows are summed. A lane
 takes four slots at a time: it reads their ids at once, then the numbers of their sources. Nothing is sorted: these numbers may
 stand anywhere, and rows that are taken together share them if they are close in space: rows follow each other, or come in an order
 that the search has left.
@@ -19,7 +19,7 @@ from jfrnn.kernels.pair_sum_cpu import TermText, constants_of, term_header
 ROWS_AT_ONCE = 64  # that a thread of the CPU takes
 BLOCKS_OF_ROWS = 8  # whose derivatives are summed by themselves on the CPU
 LANES = 8  # of CUDA that serve a row
-_MANY = 1 << 15  # rows
+_MANY = 1 << 15  # rows, from which fewer lanes sum over each
 _BLOCK = 128
 _BLOCKS, _BLOCKS_IN_BOX = 7, 6  # that share a multiprocessor: more of them, and numbers of a loop leave their registers
 

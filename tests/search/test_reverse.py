@@ -267,6 +267,17 @@ MEASURED = [(box, dim, 1.0) for box in BOXES for dim in (2, 3)] + [("open", 3, 1
 PAIRWISE = [("open", 2, 1.0, True, np.float64), ("images", 3, 1.0, False, np.float32), ("open", 3, 1e-24, False, np.float32)]
 
 
+def test_derivatives_of_distances_have_the_same_bits_in_each_call():
+    """Threads share the rows, and none knows which of them it gets."""
+    x = jnp.asarray(np.random.default_rng(3).random((20_000, 3)), jnp.float32)
+    nbrs = jfrnn.search(x, 0.06, capacity=64, backend="warp")
+    slopes = jax.jit(jax.grad(lambda x: jnp.sum(jnp.sin(40 * nbrs.distances(x)[0]))))
+    first = np.asarray(slopes(x))
+    assert np.count_nonzero(first) > 50_000
+    for _ in range(10):
+        np.testing.assert_array_equal(slopes(x), first)
+
+
 @pytest.mark.parametrize(
     ("box", "dim", "scale", "skinned", "dtype"),
     sparing(((*each, *kind) for each, kind in product(MEASURED, product((False, True), (np.float32, np.float64)))), PAIRWISE),

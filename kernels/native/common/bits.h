@@ -1,8 +1,9 @@
-// The bits of floats.
+// The bits of floats, and their size.
 #pragma once
 #include "constants.h"
 #include "device.h"
 
+JFRNN_FUNCTION real size_of(real x) { return x < 0 ? -x : x; }
 struct Bits {  // of floats
     enum { MANTISSA = DOUBLE ? 52 : 23, EXPONENTS = DOUBLE ? 0x7ff : 0xff, BIAS = DOUBLE ? 1023 : 127 };
     JFRNN_FUNCTION unsigned long long of(real x) {

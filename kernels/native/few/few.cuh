@@ -63,7 +63,6 @@ struct FewPairs : FewArguments, Space {
             tight = tight || (length[k] != 0 && outer > real(0.49) * size_of(length[k]));
         }
     }
-    JFRNN_FUNCTION real size_of(real x) { return x < 0 ? -x : x; }
     JFRNN_MEMBER const real* query_row() const { return queries + (long long)ROW * (is_query ? query : 0); }
     JFRNN_MEMBER int first_of(int word) const { return 32 * (share * words + word); }
 

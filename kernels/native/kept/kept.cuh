@@ -62,9 +62,9 @@ struct KeptLane : Kept {
                     read_entry(first + place + k, some.ids[k], some.codes[k]);
     }
     // Calls `visit(home, place, id, numbers, verdict, pair)` for the entries of the row that this lane takes, at home (judge) where all
-    // of the warp are. Those in doubt come once more,
-    // after they were decided: so rare a call stands outside of what every entry takes. `settle(place, pairs, lengths)` comes last: one
-    // bit for each of the entries from `place` on, and (MEASURED) distances.
+    // of the warp are. Those in doubt come once more, after they were decided: so rare a call stands outside of what every entry takes.
+    // Those that were sure do not: the band of images is wider than that of points as they are. `settle(place, pairs, lengths)` comes
+    // last: one bit for each of the entries from `place` on, and (MEASURED) distances.
     template <class Visit, class Settle>
     JFRNN_MEMBER void walk(const OwnPoint& own, Visit visit, Settle settle) const {
         const long long first = is_row ? first_entry(row) : 0;

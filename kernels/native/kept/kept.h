@@ -102,7 +102,6 @@ struct Kept : KeptArguments, Space {
     }
     JFRNN_MEMBER real scale() const { return SCALED ? step_scale : real(1); }  // which is known where it is 1
     JFRNN_INLINE static Number larger(Number x, Number y) { return Math::select(Math::gt(x, y), x, y); }
-    JFRNN_FUNCTION real size_of(real x) { return x < 0 ? -x : x; }
 
     JFRNN_MEMBER int code_at(long long slot) const { return image_code(codes, slot); }
     // The source and the image code that an entry of a row names: the id in a slot of the list, or (REVERSED) a slot.

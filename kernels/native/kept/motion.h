@@ -19,7 +19,6 @@ struct Motion {
     const real* limit;         // [1] the square of a motion below which a list holds
     const Lattice lattice;
 
-    JFRNN_FUNCTION real size_of(real x) { return x < 0 ? -x : x; }
     // A point, near the box: one that is far away is moved by multiples of 256 vectors, exactly (jfrnn/_geometry/far.py).
     JFRNN_MEMBER void take(long long i, real* p) const {
         for (int k = 0; k < DIM; ++k) {

@@ -46,7 +46,7 @@ struct Moved : MovedArguments {
             near_lanes &= mask_of(__builtin_elementwise_abs(lanes_from(now + at) - lanes_from(reference + at)), near, BelowOrAt());
         bool all = near_lanes == lanes_before(LANES);
         for (; at < end; ++at)
-            all &= Motion::size_of(now[at] - reference[at]) <= near;
+            all &= size_of(now[at] - reference[at]) <= near;
         return all;
     }
     bool has_moved(int from, int to) const {
