@@ -45,7 +45,8 @@ class Config(Table):
     dtype: Dtype = "float32"  # of all numbers
     repeats: Annotated[int, Field(ge=1)] = 20  # fewest timed runs
     min_seconds: Annotated[FiniteFloat, Field(ge=0)] = 0.5  # runs go on until they took this long together [s]
-    steps: Annotated[int, Field(ge=1)] = 10  # of the fluid, per timed run
+    together: Annotated[int, Field(ge=1)] = 1  # calls per timed run, of which the last is waited for: as steps follow each other
+    steps: Annotated[int, Field(ge=1)] = 10  # of the fluid, per call
     check_most: Annotated[int, Field(ge=0)] = 40_000_000  # one device counts pairs, and runs the fluid, up to so many particles
     virtual_devices: Annotated[int, Field(ge=0)] = 0  # of the CPU; 0: the devices that there are
     backend: Literal["auto", "warp", "jax"] = "auto"
@@ -212,8 +213,14 @@ def _describe(particles: distributed.Particles, spec: Spec, row: table.Line) -> 
 
 
 def _time_repeats(call: Callable[[], Any], spec: Spec) -> dict[str, Any]:
-    fewest, least = spec.config.repeats, spec.config.min_seconds
-    return _measure.summarize(_measure.repeat(lambda: jax.block_until_ready(call()), fewest, least, 10 * fewest)[1])
+    fewest, least, together = spec.config.repeats, spec.config.min_seconds, spec.config.together
+
+    def calls() -> None:
+        for _ in range(together - 1):
+            call()
+        jax.block_until_ready(call())
+
+    return _measure.summarize([seconds / together for seconds in _measure.repeat(calls, fewest, least, 10 * fewest)[1]])
 
 
 def _time(work: Callable[[Any], Any], given: Any, per: int, spec: Spec, row: table.Line, compiled: Any = None) -> None:  # noqa: ANN401

@@ -123,22 +123,25 @@ def gather_seen(particles: Particles, halo: Halo) -> Seen:
     return Seen(exchange(particles.positions, halo, particles), halo.ids >= 0)
 
 
-def is_good(particles: Particles, halo: Halo) -> Array:
-    """Say on every shard whether a halo belongs to these rows and no particle is missing in it; [] bool."""
+def take_halo(particles: Particles, halo: Halo | None) -> tuple[Halo, Array]:
+    """Return a halo, made anew without one, and whether it belongs to these rows and no particle is missing in it, [] bool."""
+    if halo is None:
+        made = halo_in_shard(particles)
+        return made, (made.status & OVERFLOWS.value) == 0
     other = jnp.any(halo.ids[: particles.sizes.particles] != particles.ids)
-    return ~lax.pmax(other, particles.mesh.axis_names) & ((halo.status & OVERFLOWS.value) == 0)
+    return halo, ~lax.pmax(other, particles.mesh.axis_names) & ((halo.status & OVERFLOWS.value) == 0)
 
 
 @functools.partial(jax.jit, static_argnames="asked")
 def counts(particles: Particles, halo: Halo | None, asked: Asked) -> Array:
     def count_shard(particles: Particles, halo: Halo | None) -> Array:
-        halo = halo_in_shard(particles) if halo is None else halo
+        halo, good = take_halo(particles, halo)
         x, active = gather_seen(particles, halo)
         radius = list_radius(asked.cutoff, asked.skin, np.dtype(x.dtype))
         counts = count(
             x, radius, box=particles.box, include_self=asked.include_self, closed=asked.closed, active=active, backend=asked.backend
         )
-        return mark_rows(counts[: particles.sizes.particles], is_good(particles, halo))
+        return mark_rows(counts[: particles.sizes.particles], good)
 
     return over_shards(count_shard, particles, of_shards(particles.mesh), lax.stop_gradient(particles), halo)
 

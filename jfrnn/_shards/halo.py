@@ -23,11 +23,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
+from jax.sharding import Mesh
 
 from jfrnn._geometry import Status
 from jfrnn._search import MOST_PAIRS, saturating_add
-from jfrnn._shards.particles import Particles, Required, of_shards, share_bits
-from jfrnn._tracing import set_places
+from jfrnn._shards.particles import Particles, Required, of_all_shards, of_shards, share_bits, share_largest
+from jfrnn._tracing import Packed, pack_parts, packed_places
 
 
 @jax.tree_util.register_dataclass
@@ -107,26 +108,27 @@ def halo_in_shard(particles: Particles) -> Halo:
     status, sent = jnp.int32(0), jnp.int32(0)
     for stage in stages(particles):
         extents = _extents(particles, stage)
-        members, farthest = _members(x, numbers > 0, extents, particles, stage)
+        members, farthest = _members(x, numbers, extents, particles, stage)
         room = particles.sizes.halo[stage.number]
-        counts = [jnp.sum(member, dtype=jnp.int32) for member in members]
-        rows = [set_places(member, room) for member in members]
+        counts = [member.total() for member in members]
+        rows = [packed_places(member, room) for member in members]
         sends.append(jnp.stack(rows) if rows else jnp.zeros((0, room), jnp.int32))
         largest = functools.reduce(jnp.maximum, counts, jnp.int32(0))
         status = status | jnp.where(largest > room, Status.HALO_OVERFLOW.value, 0)
         status = status | jnp.where(farthest > particles.sizes.hops[stage.number], Status.HALO_TOO_FAR.value, 0)
         sizes, hops, sent = [*sizes, largest], [*hops, farthest], functools.reduce(saturating_add, counts, sent)
         x, numbers = (_append_received(leaf, sends[-1], particles, stage) for leaf in (x, numbers))
-    names, none = particles.mesh.axis_names, jnp.int32(0)
-    required = Required(none, lax.pmax(jnp.stack(sizes), names), lax.pmax(jnp.stack(hops), names), none)
-    return Halo(tuple(sends), numbers - 1, share_bits(status, particles.mesh), required, _psum(sent, names))
+    mesh, none = particles.mesh, jnp.int32(0)
+    required = Required(none, share_largest(jnp.stack(sizes), mesh), share_largest(jnp.stack(hops), mesh), none)
+    return Halo(tuple(sends), numbers - 1, share_bits(status, mesh), required, _sum_shards(sent, mesh))
 
 
-def _psum(x: Array, names: str | tuple[str, ...]) -> Array:
+def _sum_shards(x: Array, mesh: Mesh) -> Array:
     """Sum nonnegative int32 over all shards, saturating at the largest int32."""
-    high, low = lax.psum((x >> 15, x & 0x7FFF), names)  # neither overflows for up to 32 768 shards
+    each = of_all_shards(x, mesh)
+    high, low = jnp.sum(each >> 15), jnp.sum(each & 0x7FFF)  # neither overflows for up to 32 768 shards
     high = high + (low >> 15)
-    return jnp.where(high > 0xFFFF, MOST_PAIRS, (high << 15) | (low & 0x7FFF))
+    return jnp.where(high > 0xFFFF, MOST_PAIRS, (high << 15) | (low & 0x7FFF)).astype(jnp.int32)
 
 
 def exchange(leaf: Array, halo: Halo, particles: Particles) -> Array:
@@ -159,12 +161,14 @@ class _Extents(NamedTuple):
 def _extents(particles: Particles, stage: _Stage) -> _Extents:
     """Share the extents along an axis; shards that differ only in later axes form a union, as those axes are served from there."""
     x = lax.stop_gradient(particles.positions)
-    there = (particles.ids >= 0) & jnp.isfinite(x).all(axis=1)
     center = _center(particles, stage)
-    u, error = _from_center(x, center, particles)
-    # One column at a time: all at once take 4 to 7 times as long on a GPU, more than the rest of a halo.
-    low = jnp.stack([jnp.min((u - error)[:, k], initial=jnp.inf, where=there) for k in range(particles.dim)])
-    high = jnp.stack([jnp.max((u + error)[:, k], initial=-jnp.inf, where=there) for k in range(particles.dim)])
+    # One axis of space at a time: all at once take 4 to 7 times as long on a GPU, more than the rest of a halo.
+    ends = []
+    for axis in range(particles.dim):
+        u, error = _from_center(x[:, axis], center[axis], axis, particles)
+        there = (particles.ids >= 0) & jnp.isfinite(u)
+        ends.append((jnp.min(u - error, initial=jnp.inf, where=there), jnp.max(u + error, initial=-jnp.inf, where=there)))
+    low, high = (jnp.stack(each) for each in zip(*ends, strict=True))
     later = particles.mesh.axis_names[stage.number + 1 :]
     if later:
         low, high = lax.pmin(low, later), lax.pmax(high, later)
@@ -188,39 +192,39 @@ def _center(particles: Particles, stage: _Stage) -> Array:
     return jnp.where(np.array(box.periodic), center, 0)
 
 
-def _from_center(x: Array, center: Array, particles: Particles) -> tuple[Array, Array]:
-    """Return coordinates relative to the center, wrapped along periodic axes, and 4 times their error bound."""
+def _from_center(x: Array, center: Array, axis: int, particles: Particles) -> tuple[Array, Array]:
+    """Return coordinates [n] along an axis from its center, wrapped if it is periodic, and 4 times their error bound [n] or []."""
     box = particles.box
-    if box is None:
-        return x, jnp.zeros_like(x)
-    lengths, periodic = jnp.where(np.array(box.periodic), box.vectors, 1), np.array(box.periodic)
+    if box is None or not box.periodic[axis]:
+        return x, jnp.zeros((), x.dtype)
+    length = box.vectors[axis]
     t = x - center
-    u = t - lengths * jnp.round(t / lengths)
-    error = 4 * jnp.finfo(x.dtype).eps * (jnp.abs(t) + lengths)
-    return jnp.where(periodic, u, x), jnp.where(periodic, error, 0)
+    u = t - length * jnp.round(t / length)
+    return u, 4 * jnp.finfo(x.dtype).eps * (jnp.abs(t) + length)
 
 
-def _members(x: Array, there: Array, extents: _Extents, particles: Particles, stage: _Stage) -> tuple[list[Array], Array]:
-    """Say which rows [rows] belong into each message, and return the number of hops that the farthest should have gone."""
+def _members(x: Array, numbers: Array, extents: _Extents, particles: Particles, stage: _Stage) -> tuple[list[Packed], Array]:
+    """Say which rows belong into each message, and return the number of hops that the farthest should have gone."""
     here, served = lax.axis_index(stage.name), stage.offsets(particles.sizes.hops[stage.number])
 
-    def is_needed(offset: Array | int) -> Array:
+    def needed(offset: Array | int, rows: slice) -> Array:
         place = here + offset
         within = (place >= 0) & (place < stage.shards) | stage.periodic
-        return there & within & _is_near(x, jax.tree.map(lambda each: each[place % stage.shards], extents), particles)
+        extent = jax.tree.map(lambda each: each[place % stage.shards], extents)
+        return (numbers[rows] > 0) & within & _is_near(x[rows], extent, particles)
 
-    members = [is_needed(offset) for offset in served]
+    members = [pack_parts(functools.partial(needed, offset), len(x)) for offset in served]
     if stage.periodic:
         others = sorted(set(range(1, stage.shards)) - set(served))
     else:
         others = [k for k in range(1 - stage.shards, stage.shards) if k and k not in served]
-    met = [jnp.where(member.any(), stage.hops_to(jnp.int32(k)), 0) for member, k in zip(members, served, strict=True)]
+    met = [jnp.where(member.words.any(), stage.hops_to(jnp.int32(k)), 0) for member, k in zip(members, served, strict=True)]
     farthest = functools.reduce(jnp.maximum, met, jnp.int32(0))
     if others:
         offsets = jnp.asarray(others, jnp.int32)
 
         def look(k: Array, farthest: Array) -> Array:
-            return jnp.maximum(farthest, jnp.where(is_needed(offsets[k]).any(), stage.hops_to(offsets[k]), 0))
+            return jnp.maximum(farthest, jnp.where(needed(offsets[k], slice(None)).any(), stage.hops_to(offsets[k]), 0))
 
         farthest = lax.fori_loop(0, len(others), look, farthest)
     return members, farthest
@@ -228,13 +232,13 @@ def _members(x: Array, there: Array, extents: _Extents, particles: Particles, st
 
 def _is_near(x: Array, extent: _Extents, particles: Particles) -> Array:
     """Say which points are within reach of an extent along every axis, [rows] bool; the module docstring covers rounding."""
-    u, error = _from_center(x, extent.center, particles)
-
-    def distance(u: Array) -> Array:
-        return jnp.maximum(extent.low - u, u - extent.high)
-
-    apart = distance(u)
-    if particles.box is not None:
-        lengths = jnp.where(np.array(particles.box.periodic), particles.box.vectors, 0)
-        apart = jnp.minimum(apart, jnp.minimum(distance(u + lengths), distance(u - lengths)))
-    return (apart <= np.asarray(particles.reach, x.dtype) + error).all(axis=1)
+    box, reach = particles.box, np.asarray(particles.reach, x.dtype)
+    near = []
+    for axis, (low, high, center) in enumerate(zip(*extent, strict=True)):
+        u, error = _from_center(x[:, axis], center, axis, particles)
+        images = [u]
+        if box is not None and box.periodic[axis]:
+            images += [u + box.vectors[axis], u - box.vectors[axis]]
+        apart = functools.reduce(jnp.minimum, [jnp.maximum(low - image, image - high) for image in images])
+        near.append(apart <= reach + error)
+    return functools.reduce(jnp.logical_and, near)

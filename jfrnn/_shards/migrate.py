@@ -11,7 +11,7 @@ from jax import Array, lax
 
 from jfrnn._geometry import Status, ordered_bits
 from jfrnn._shards.halo import halo_in_shard
-from jfrnn._shards.particles import Particles, share_bits, spec_of
+from jfrnn._shards.particles import Particles, spec_of
 from jfrnn._tracing import Tree, set_places
 
 _DIGIT = 2  # bits of a bound per round of counting
@@ -52,7 +52,7 @@ def _migrate_shard(particles: Particles) -> Particles:
     goes = jnp.where(there, jnp.where(fits, wanted, here), shards)
     rows = _move((x, particles.ids, particles.values), goes, particles)
     positions, ids, values = jax.tree.map(lambda leaf: _where_used(rows[1], leaf), rows)
-    status = particles.status | share_bits(jnp.where(fits, 0, Status.SHARD_OVERFLOW.value).astype(jnp.int32), mesh)
+    status = particles.status | jnp.where(fits, 0, Status.SHARD_OVERFLOW.value)
     bounds = tuple(jnp.where(fits, new, old) for new, old in zip(bounds, particles.bounds, strict=True))
     moved = dataclasses.replace(particles, positions=positions, ids=ids, values=values, bounds=bounds)
     halo = halo_in_shard(moved)

@@ -20,7 +20,6 @@ from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 from jfrnn._geometry import Box, Status, check_again, names_of_bits, shape_of
 from jfrnn._tracing import Given, Tree
 
-_STEP = 8  # sizes are rounded up to multiples of this, so that similar scenes share a compiled program
 OVERFLOWS = Status.ROW_OVERFLOW | Status.SHARD_OVERFLOW | Status.HALO_OVERFLOW | Status.HALO_TOO_FAR
 
 
@@ -210,8 +209,9 @@ def spec_of(particles: Particles) -> Particles:
 
 
 def room(size: int) -> int:
-    """Round a size up, so that similar scenes share one compiled program."""
-    return max(-(-size // _STEP) * _STEP, _STEP)
+    """Round a size up, so that similar scenes share one compiled program, and flags of many rows fill words (`pack_parts`)."""
+    step = 8 if size < 1024 else 32
+    return max(-(-size // step) * step, step)
 
 
 def _enough(sizes: Sizes, required: Required, mesh: Mesh, slack: float) -> Sizes:
@@ -277,10 +277,22 @@ def resize(particles: Particles, sizes: Sizes) -> Particles:
     return dataclasses.replace(particles, **changed, status=status, required=required, sizes=sizes)
 
 
+def of_all_shards(mine: Array, mesh: Mesh) -> Array:
+    """Return an array of every shard, [shards, ...], inside `shard_map`.
+
+    What is told to all is gathered rather than reduced: a compiler joins gatherings, whatever they are for, into one message.
+    """
+    return lax.all_gather(mine, mesh.axis_names)
+
+
 def share_bits(status: Array, mesh: Mesh) -> Array:
     """Return the bits that are set on any shard, inside `shard_map`."""
-    each = np.arange(Status(max(Status)).value.bit_length(), dtype=np.int32)
-    return jnp.sum(lax.pmax((status >> each) & 1, mesh.axis_names) << each, dtype=jnp.int32)
+    return lax.reduce(of_all_shards(status, mesh), np.int32(0), lax.bitwise_or, (0,))
+
+
+def share_largest(size: Array, mesh: Mesh) -> Array:
+    """Return the largest value of any shard, entry by entry, inside `shard_map`."""
+    return jnp.max(of_all_shards(size, mesh), axis=0)
 
 
 def check(met: Met, room: str) -> None:

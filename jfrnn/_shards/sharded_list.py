@@ -17,7 +17,7 @@ from jfrnn._search import NeighborList, has_moved_too_far, round_capacity, searc
 from jfrnn._shards.calls import Asked, check_halo, count_capacity, gather_seen, over_shards
 from jfrnn._shards.halo import Halo, halo_in_shard, halo_spec
 from jfrnn._shards.migrate import migrate
-from jfrnn._shards.particles import OVERFLOWS, Particles, Required, check, of_shards, share_bits
+from jfrnn._shards.particles import OVERFLOWS, Particles, Required, check, of_shards, share_bits, share_largest
 from jfrnn._shards.scatter import fetch
 
 
@@ -179,7 +179,7 @@ def list_on_shards(particles: Particles, asked: Asked, capacity: int) -> Neighbo
             backend=asked.backend,
         )
         status = share_bits(made.status | halo.status, mesh)
-        required = halo.required._replace(row=lax.pmax(made.required, mesh.axis_names))
+        required = halo.required._replace(row=share_largest(made.required, mesh))
         return jax.tree.map(lambda leaf: leaf[None], made), halo, made.count[: particles.sizes.particles], status, required
 
     out = rows, halo_spec(particles), rows, same, Required(same, same, same, same)

@@ -14,8 +14,18 @@ from jax.core import Tracer
 from jfrnn._engine import parse_backend
 from jfrnn._geometry import ROWS_ARE_WHOLE, Status, check_capacity, check_flag, check_slack, known_status, mark_rows
 from jfrnn._search import NeighborList
-from jfrnn._shards.calls import BACKENDS, Asked, check_asked, check_halo, count_capacity, counts, gather_seen, is_good, over_shards
-from jfrnn._shards.halo import Halo, exchange, halo_in_shard
+from jfrnn._shards.calls import (
+    BACKENDS,
+    Asked,
+    check_asked,
+    check_halo,
+    count_capacity,
+    counts,
+    gather_seen,
+    over_shards,
+    take_halo,
+)
+from jfrnn._shards.halo import Halo, exchange
 from jfrnn._shards.particles import Particles, of_shards
 from jfrnn._shards.sharded_list import Neighbors, list_on_shards
 from jfrnn._sums import pair_sum as pair_sum_on_one
@@ -176,7 +186,7 @@ def _sums(
     compensated: bool,
 ) -> Tree:
     def sum_shard(particles: Particles, halo: Halo | None, local: NeighborList | None, values: Tree) -> Tree:
-        halo = halo_in_shard(particles) if halo is None else halo
+        halo, good = take_halo(particles, halo)
         x, active = gather_seen(particles, halo)
         theirs = jax.tree.map(lambda leaf: exchange(leaf, halo, particles), values)
         options: dict[str, Any] = {"reduce": reduce, "compensated": compensated}
@@ -186,7 +196,6 @@ def _sums(
             sums = pair_sum_on_one(fn, x, asked.cutoff, theirs, **options)
         else:
             sums = pair_sum_on_one(fn, x, None, theirs, neighbors=jax.tree.map(lambda leaf: leaf[0], local), **options)
-        good = is_good(particles, halo)
         return jax.tree.map(lambda leaf: mark_rows(leaf[: particles.sizes.particles], good), sums)
 
     return over_shards(sum_shard, particles, of_shards(particles.mesh), particles, halo, local, values)

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jfrnn._tracing.flags import largest_of, set_places
+from jfrnn._tracing.flags import largest_of, pack_parts, packed_places, set_places
 
 MOST = (1, 40, 1100)
 
@@ -32,6 +32,20 @@ def test_the_last_and_the_first_flag_of_each_word_are_found():
         first, most, _ = places_of(np.arange(96) == k)
         assert first.tolist() == [k]
         assert most.tolist() == [k, *[96] * 39]
+
+
+@pytest.mark.parametrize("n", [8, 32, 88, 1024])
+@pytest.mark.parametrize("share", [0.0, 0.03, 0.5, 1.0])
+def test_flags_that_are_packed_by_parts(n, share):
+    flags = np.random.default_rng(n).random(n) < share
+    packed = pack_parts(lambda rows: jnp.asarray(flags)[rows], n)
+    assert int(packed.total()) == flags.sum()
+    for most in MOST:
+        places = np.asarray(packed_places(packed, most))
+        found = places[places < n]
+        assert places.tolist() == [*found, *[n] * (most - len(found))]  # what is unused stands behind
+        assert len(set(found)) == len(found) == min(flags.sum(), most)
+        assert flags[found].all()
 
 
 @pytest.mark.parametrize("dtype", [np.int8, np.int32, np.uint32])
