@@ -9,21 +9,19 @@ import importlib.util
 import os
 import re
 import sys
-import threading
+from collections.abc import Sequence
 from pathlib import Path
 
 _NAMES = {"win32": ("warp.dll", "warp-clang.dll"), "darwin": ("libwarp.dylib", "libwarp-clang.dylib")}
 _LINUX = ("warp.so", "warp-clang.so")
 _TEXT, _FLAG, _NUMBER = ctypes.c_char_p, ctypes.c_bool, ctypes.c_int
 # What Warp compiles kernels with: all instructions of this processor, and functions that are inlined wherever they are called.
-NATIVE = ("-march=native",)
-OPTIONS = (*NATIVE, "-mllvm", "-inline-threshold=9000", "-mllvm", "-inline-cold-callsite-threshold=3000")
+OPTIONS = ("-march=native", "-mllvm", "-inline-threshold=9000", "-mllvm", "-inline-cold-callsite-threshold=3000")
 OPTIONS += ("-mllvm", "-slp-recursion-max-depth=4")
+# Added where no loop over pairs is compiled, which takes a third of the time then. Threads compile beside each other only where the
+# options of LLVM (-mllvm) are the same.
+APART = ("-fno-inline-functions",)
 _COMPILED_WITH = (_TEXT, _TEXT, _TEXT, _TEXT, _FLAG, _FLAG, _FLAG, _FLAG, ctypes.c_void_p, _NUMBER, _FLAG, _FLAG, _TEXT, _NUMBER)
-# The lock of all that starts, compiles and lays plans, one thread at a time.
-one_at_a_time = threading.RLock()
-if hasattr(os, "register_at_fork"):  # a lock that another thread holds while a process forks would stay taken in the new one
-    os.register_at_fork(before=one_at_a_time.acquire, after_in_parent=one_at_a_time.release, after_in_child=one_at_a_time.release)
 
 
 @functools.cache
@@ -63,7 +61,12 @@ def cache_folder() -> Path:
 
 
 @functools.cache
-def _library() -> ctypes.CDLL:
+def library() -> ctypes.CDLL:
+    """Return Warp's compiler, which is loaded.
+
+    Raises:
+        RuntimeError: This Warp has none, or it does not start.
+    """
     folder, (core_name, name) = warp_root() / "bin", _NAMES.get(sys.platform, _LINUX)
     if not (folder / name).exists():
         raise RuntimeError("this Warp was built without its CPU compiler")
@@ -84,37 +87,36 @@ def _library() -> ctypes.CDLL:
     return clang
 
 
-def compile_object(text: str, source: Path, target: Path, fused: bool, inlined: bool) -> None:
-    """Compile C++ for this processor.
+def compile_object(text: str, source: Path, target: Path, fused: bool, options: Sequence[str]) -> None:
+    """Compile C++ for this processor. Threads may do so beside each other.
 
     Args:
         text: What is compiled.
         source: Its file, of which messages speak.
         target: The object file that is written.
         fused: Whether products may be contracted with sums.
-        inlined: Whether large functions, too, become part of those that call them.
+        options: Those of Clang.
 
     Raises:
         RuntimeError: It does not compile.
     """
-    chosen = OPTIONS if inlined else NATIVE
     files = str(source).encode(), str(warp_root() / "native").encode(), str(target).encode()
-    flags = (ctypes.c_char_p * (len(chosen) + 1))(*(option.encode() for option in chosen), None)
-    options = False, False, fused, True, ctypes.addressof(flags), 2, False, False, None, 256
-    if _library().wp_compile_cpp(text.encode(), *files, *options):
+    flags = (ctypes.c_char_p * (len(options) + 1))(*(option.encode() for option in options), None)
+    more = False, False, fused, True, ctypes.addressof(flags), 2, False, False, None, 256
+    if library().wp_compile_cpp(text.encode(), *files, *more):
         raise RuntimeError("see what Clang says on standard error")
 
 
 def load_object(path: Path, handle: str) -> bytes | None:
     """Load an object file by a name of its own; return that name, or None where it cannot be loaded."""
-    return None if _library().wp_load_obj(str(path).encode(), handle.encode(), False) else handle.encode()
+    return None if library().wp_load_obj(str(path).encode(), handle.encode(), False) else handle.encode()
 
 
 def find_function(handle: bytes, name: str) -> int:
     """Return the address of a function, or 0."""
-    return _library().wp_lookup(handle, name.encode())
+    return library().wp_lookup(handle, name.encode())
 
 
 def unload_object(handle: bytes) -> None:
     """Give back the memory of an object file."""
-    _library().wp_unload_obj(handle)
+    library().wp_unload_obj(handle)

@@ -17,14 +17,15 @@ import sys
 import tempfile
 import threading
 import weakref
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future
 from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from jfrnn.kernels import _clang, _driver
-from jfrnn.kernels._clang import one_at_a_time
+from jfrnn.kernels import _clang, _driver, _jobs
+from jfrnn.kernels._jobs import one_at_a_time
 from jfrnn.kernels._program import Program
 from jfrnn.kernels._text import resolve
 
@@ -35,6 +36,7 @@ _DIGEST = 64  # hexadecimal digits
 _ROOM = 1 << 22  # bytes that a compiler may need
 _ATTEMPTS = 10
 Start = Callable[[], Any]
+Build = Callable[[Program, Path], Path]
 # What C's own headers give to that of XLA.
 _TYPES = """typedef __SIZE_TYPE__ size_t;
 typedef __INT8_TYPE__ int8_t;
@@ -46,6 +48,7 @@ typedef __UINT64_TYPE__ uint64_t;
 #define offsetof(type, member) __builtin_offsetof(type, member)
 """
 notes: list[str] = []  # what users should be warned of, until they are
+_moving = threading.Lock()  # of who finds that programs cannot be kept
 _loaded: weakref.WeakValueDictionary[tuple[Program, str], "Library"] = weakref.WeakValueDictionary()
 
 
@@ -118,6 +121,20 @@ def load(program: Program, device: str = "cpu", start: Start = _start_warp) -> L
         return found
 
 
+def begin(program: Program, device: str = "cpu", start: Start = _start_warp) -> Future[Path] | None:
+    """Let another thread compile a program, beside others, if no whole file of it is kept; return what waits for that, or None.
+
+    Not for a thread that holds `one_at_a_time`. Arguments and errors are those of `load`; the latter come when it is waited for.
+    """
+    found = _driver.find_device(int(device.partition(":")[2])) if program.cuda else None
+    name, build = _name(program, found, None), _builder(program, found, None, start)
+    if _is_whole(kernel_folder() / _FOLDER / name):
+        return None
+    if program.cuda:
+        start()
+    return _jobs.begin((kernel_folder(), name), functools.partial(_make, program, build, name))
+
+
 def kernel_folder() -> Path:
     """Return the folder in which programs are kept, and in which Warp may keep its own."""
     return _folders()[-1]
@@ -161,17 +178,33 @@ def find_binary(
         arch: The architecture in place of a device, as in 90; then PTX is made.
         start: As in `load`.
     """
+    name = _name(program, device, arch)
+    kept = kernel_folder() / _FOLDER / name
+    return kept if _is_whole(kept) else _make(program, _builder(program, device, arch, start), name)
+
+
+def _name(program: Program, device: _driver.CudaDevice | None, arch: int | None) -> str:
+    """Return the name of the file of a program."""
     target = _target(program, device, arch)
-    build = functools.partial(_build_cuda, start, device, arch) if program.cuda else _build_object
     key = hashlib.sha256("\0".join((*map(str, program), *target, _clang.warp_version())).encode()).hexdigest()[:20]
-    name = f"{program.name[:80]}_{key}{target[0]}"
-    kept = kernel_folder() / _FOLDER
-    if _is_whole(kept / name):
-        return kept / name
+    return f"{program.name[:80]}_{key}{target[0]}"
+
+
+def _builder(program: Program, device: _driver.CudaDevice | None, arch: int | None, start: Start) -> Build:
+    """Return what compiles a program to a file beside its source."""
+    if program.cuda:
+        return functools.partial(_build_cuda, start, device, arch)
+    return functools.partial(_build_object, _clang.OPTIONS if program.inlined else (*_clang.OPTIONS, *_clang.APART))
+
+
+def _make(program: Program, build: Build, name: str) -> Path:
+    """Compile a program to a file that is kept, or where none can be, in a temporary folder."""
     try:
-        return _compile(program, build, kept / name)
+        return _compile(program, build, kernel_folder() / _FOLDER / name)
     except OSError:
-        notes.append(temporary_folder())
+        with _moving:
+            if not keeps_no_programs():
+                notes.append(temporary_folder())
         return _compile(program, build, kernel_folder() / _FOLDER / name)
 
 
@@ -217,9 +250,9 @@ def _processor() -> str:
     return next((line for line in lines if line.startswith(("flags", "Features"))), platform.machine())
 
 
-def _build_object(program: Program, source: Path) -> Path:
+def _build_object(options: Sequence[str], program: Program, source: Path) -> Path:
     binary = source.with_suffix(".o")
-    _clang.compile_object(program.text, source, binary, program.fused, program.inlined)
+    _clang.compile_object(program.text, source, binary, program.fused, options)
     return binary
 
 
@@ -237,7 +270,7 @@ def _build_cuda(start: Start, device: _driver.CudaDevice | None, arch: int | Non
     return binary
 
 
-def _compile(program: Program, build: Callable[[Program, Path], Path], path: Path) -> Path:
+def _compile(program: Program, build: Build, path: Path) -> Path:
     """Compile a program to a file.
 
     Raises:

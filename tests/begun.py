@@ -52,6 +52,7 @@ def fork():
 
     def compile_all():
         for k in range(10**6):
+            _compile.begin(program(f"beside{k}"))
             _compile.load(program(f"parent{k}"))
             if over.is_set():
                 return
@@ -81,6 +82,7 @@ def _child(k):
         refused = all(is_refused(work) for work in (lambda: jfrnn.search(POINTS, 0.3), lambda: KEPT[0].vectors(POINTS)))
         assert len(primitive_neighbor_list("i", True, np.eye(3), POINTS, 0.3)) > 0  # without JAX
         apart(lambda: _compile.load(program(f"child{k}")).address_of("nothing"))
+        assert _compile.begin(program(f"child{k} beside")).result().exists()
         desk.drop(laid)
         os._exit(0 if refused else 3)
     return child

@@ -214,7 +214,8 @@ def what_is_missing_anywhere_is_told():
     halo = distributed.halo(far)
     assert jfrnn.Status(int(halo.status)) == jfrnn.Status.HALO_TOO_FAR
     assert halo.required.hops.tolist() == [2]
-    assert int(distributed.count(far, 0.5, halo=halo, backend="warp").max()) == np.iinfo(np.int32).min
+    for given in (halo, None):
+        assert int(distributed.count(far, 0.5, halo=given, backend="warp").max()) == np.iinfo(np.int32).min
 
 
 @check

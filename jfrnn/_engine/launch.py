@@ -18,6 +18,7 @@ import mmap
 import os
 import platform
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future
 from importlib.resources import files
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -26,9 +27,9 @@ import jax
 from jax import Array
 
 from jfrnn._engine.ffi import CallFrame
-from jfrnn._engine.plans import MOST_WORDS, Desk, LaidPlan, Plan, lay_plan, multiprocessors_of, open_desk
-from jfrnn._engine.start import alone, apart, compiler, warn_of_folders
-from jfrnn.kernels import one_at_a_time
+from jfrnn._engine.plans import MOST_WORDS, Desk, LaidPlan, Plan, begin_programs, lay_plan, multiprocessors_of, open_desk
+from jfrnn._engine.start import alone, apart, compiler, wait_for, warn_of_folders
+from jfrnn.kernels import Program, one_at_a_time
 
 TARGET = "jfrnn"  # what programs call; jax.export wants to be told that it stays
 Static = Any  # what a kernel is made of, and a program carries: NamedTuples of the library, tuples, texts, numbers
@@ -75,6 +76,7 @@ def kernel(make: Callable[..., Call]) -> Callable[..., Callable[..., Any]]:
 
 
 def _call(found: Call, recipe: str, *inputs: Array, output_dims: dict[str, Any]) -> Sequence[Array]:
+    begins_cold()
     dims = [output_dims[key] for key in found.results]
     written = [shape if isinstance(shape, tuple) else (shape,) for shape in dims]
     kinds = [getattr(jax.typeof(x), "manual_axis_type", None) for x in inputs]
@@ -153,18 +155,28 @@ _MakePlan = ctypes.CFUNCTYPE(None, *_Text, *_Text, ctypes.c_int, ctypes.c_void_p
 _plans: dict[tuple[str, int], LaidPlan] = {}  # by name and device, those that were made last at the end
 
 
-_ON_FIRST = -2  # in place of a device's number: the first one that the process uses
+_CPU, _CUDA_SOON, _CPU_SOON = -1, -2, -3  # in place of a CUDA device; SOON: of a program that is made, for the first device
 
 
 def _keep_plan(name: str, recipe: str, device: int) -> None:
+    """Let calls find a plan; of a program that is being made, only begin to compile what nobody has compiled yet."""
     found, shapes = _read_call(name, recipe)
-    desk = _open()
-    if device == _ON_FIRST:
+    desk, made = _open(), device not in (_CUDA_SOON, _CPU_SOON)
+    if device == _CUDA_SOON:
         device = jax.local_devices(backend="cuda")[0].local_hardware_id  # there may be others, that are not for this process
+    elif device == _CPU_SOON:
+        device = _CPU
+    if (name, device) in _plans:
+        return
+    plan = found.plan(shapes, multiprocessors_of(device))
+    begun = begin_programs(plan, device)
+    if begun and not made:
+        return
+    wait_for(begun)
     with one_at_a_time:
         if (name, device) in _plans:
             return
-        laid = lay_plan(name, found.plan(shapes, multiprocessors_of(device)), shapes, device)
+        laid = lay_plan(name, plan, shapes, device)
         while len(_plans) >= _MOST:
             desk.drop(_plans.pop(next(iter(_plans))))
         _plans[name, device] = laid
@@ -238,15 +250,36 @@ _behind_desk = _MakePlan(_make_plan)
 
 def _open() -> Desk:
     """Compile the native code, once, and lead all calls there."""
-    compiler()
+    begun = _begun()
+    wait_for([] if begun is None else [begun])
     return _opened()
+
+
+@functools.cache
+def _launcher() -> Program:
+    return compiler().launcher((Path(jax.ffi.include_dir()) / "xla" / "ffi" / "api" / "c_api.h").read_text("utf-8"))
+
+
+@functools.cache
+def _begun() -> Future[Path] | None:
+    """Begin to compile the native code; return what waits for it, or None if a file of it is kept."""
+    return compiler().begin(_launcher())
+
+
+def begins_cold() -> bool:
+    """Begin to compile the native code, while the program that calls it is traced; say whether no file of it was kept.
+
+    Who needs the native code learns of errors.
+    """
+    with contextlib.suppress(Exception):
+        return apart(_begun) is not None
+    return False
 
 
 @alone
 @functools.cache
 def _opened() -> Desk:
-    header = (Path(jax.ffi.include_dir()) / "xla" / "ffi" / "api" / "c_api.h").read_text("utf-8")
-    desk = open_desk(compiler().load(compiler().launcher(header)), _address(_behind_desk), _MOST)
+    desk = open_desk(compiler().load(_launcher()), _address(_behind_desk), _MOST)
     for name, address in zip(_PLATFORMS, desk.handlers, strict=True):
         _doors[name].lead_to(address)
     atexit.register(desk.close)  # who asks while the interpreter exits would wait for it, and it for them; no result is waited for

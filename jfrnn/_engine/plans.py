@@ -8,10 +8,12 @@ import os
 import sys
 import threading
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from jfrnn._engine.start import compiler, load_warp, warn_of_folders
-from jfrnn.kernels import Kernel, _driver
+from jfrnn.kernels import Kernel, Program, _driver
 from jfrnn.kernels._native import EXCLUDED, TABLE
 
 if TYPE_CHECKING:
@@ -90,6 +92,19 @@ def share(kernel: Kernel, places: int, each: int = PLACES_PER_THREAD) -> Launch:
 def ask_for_huge_pages(array: str, size: int) -> list[HugePages]:
     """Return the request for a large array; a small one is not worth it."""
     return [HugePages(array, size)] if size >= _HUGE else []
+
+
+def begin_programs(plan: Plan, device: int) -> list[Future[Path]]:
+    """Let threads compile what a plan launches on a device, and no file keeps; return what waits for them."""
+    # what is launched last takes longest to compile
+    programs = dict.fromkeys(step.kernel.program for step in reversed(plan.steps) if isinstance(step, Launch))
+    begun = [compiler().begin(program, _place(program, device), load_warp) for program in programs]
+    return [job for job in begun if job is not None]
+
+
+def _place(program: Program, device: int) -> str:
+    """Return on what a program runs whose calls are on a device, as Warp names it."""
+    return f"cuda:{device}" if device >= 0 and program.cuda else "cpu"
 
 
 # --- as native code reads them ----------------------------------------------------------------------------------------
@@ -244,8 +259,7 @@ def _lay_step(plan: Plan, places: dict[str, int], device: int, held: list[Any], 
     arrays = [field for field in kernel.fields if field.is_array and field.name not in left_out]
     pairs = [number for field in arrays for number in (field.place, places[field.name])]
     given = kernel.pack(numbers)
-    on_cuda = device >= 0 and kernel.program.cuda
-    library = compiler().load(kernel.program, f"cuda:{device}" if on_cuda else "cpu", load_warp)
+    library = compiler().load(kernel.program, place := _place(kernel.program, device), load_warp)
     template, places_of_arrays = (ctypes.c_ubyte * len(given)).from_buffer(given), (ctypes.c_int * len(pairs))(*pairs)
     held += [library, template, places_of_arrays]
     return _Step(
@@ -254,7 +268,7 @@ def _lay_step(plan: Plan, places: dict[str, int], device: int, held: list[Any], 
         arrays=ctypes.addressof(places_of_arrays),
         size=len(given),
         array_count=len(arrays),
-        kind=(_CUDA_BESIDE if step.beside else _CUDA) if on_cuda else _SHARED if step.threads > 1 else _ONCE,
+        kind=(_CUDA_BESIDE if step.beside else _CUDA) if place != "cpu" else _SHARED if step.threads > 1 else _ONCE,
         block=kernel.block,
         threads=step.threads,
     )

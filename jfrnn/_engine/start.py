@@ -4,13 +4,15 @@ import contextlib
 import functools
 import importlib
 import inspect
+import logging
 import os
 import sys
 import tempfile
 import threading
+import time
 import warnings
-from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from types import ModuleType
 from typing import Any, TypeVar
 
@@ -19,6 +21,9 @@ from jfrnn.kernels import _clang, one_at_a_time
 _NO_DRIVER = b"Could not find or load the NVIDIA CUDA driver"
 _LINUX = sys.platform == "linux"
 Result = TypeVar("Result")
+_LONG = 2.0  # seconds
+_said = False
+_log = logging.getLogger("jfrnn")  # which shows warnings on standard error, unless users say otherwise
 INSTALL = "pip install 'warp-lang==1.19.*'"
 
 
@@ -120,6 +125,17 @@ def compiler() -> ModuleType:
     """Return `jfrnn.kernels._compile`, which needs Warp, but imports it for CUDA alone."""
     check_warp()
     return apart(functools.partial(importlib.import_module, "jfrnn.kernels._compile"))
+
+
+def wait_for(begun: Iterable[Future[Any]]) -> None:
+    """Wait for programs that threads compile; say once what one waits for, where that is long."""
+    global _said
+    ends = time.monotonic() + _LONG
+    for job in begun:
+        if not _said and not wait([job], max(ends - time.monotonic(), 0)).done:
+            _said = True
+            _log.warning("jfrnn compiles kernels, which are kept in %s for later processes", compiler().kernel_folder())
+        job.result()
 
 
 def warn_of_folders() -> None:

@@ -12,7 +12,7 @@ import jax
 import numpy as np
 
 from jfrnn._engine.problem import Inputs, Options
-from jfrnn._engine.start import compiler, warn_of_folders
+from jfrnn._engine.start import compiler, wait_for, warn_of_folders
 from jfrnn._geometry import Box, Cutoff
 from jfrnn.kernels.structure import INTS_PER_ATOM, MORE_INTS, REALS_PER_ATOM, RULES, WRONG, structure_kernel
 
@@ -99,10 +99,17 @@ _SAYS = {
 }
 
 
+def begin_to_count() -> None:
+    """Let another thread compile the kernel, if no file of it is kept."""
+    compiler().begin(structure_kernel().program)
+
+
 @functools.cache
 def _function() -> tuple[Callable[[bytes], Any], struct.Struct, Any]:
     """Return what runs the kernel, given the bytes of its arguments, how these are packed, and what has to live as long."""
     kernel = structure_kernel()
+    begun = compiler().begin(kernel.program)
+    wait_for([] if begun is None else [begun])
     library = compiler().load(kernel.program)
     warn_of_folders()
     pointers = sum(field.is_array for field in kernel.fields)

@@ -234,9 +234,24 @@ def round_capacity(slots: int) -> int:
     return -(-slots // _CAPACITY_STEP) * _CAPACITY_STEP
 
 
+_ahead = False  # whether the first search of a process has come
+
+
+def _compile_ahead(inputs: engine.Inputs, options: engine.Options) -> None:
+    """Where nothing is compiled yet, compile what lists while others compile what counts: kernels depend on no capacity."""
+    global _ahead
+    if _ahead or not options.engine.native:
+        return
+    _ahead = True
+    if engine.begins_cold():
+        engine.begin_to_count()
+        find_fields.lower(inputs, options=options, room=_CAPACITY_STEP, moving=False, reversing=False, flat=False).compile()
+
+
 def count_capacity(inputs: engine.Inputs, options: engine.Options, slack: Real) -> int:
     """Count the neighbors of concrete positions; return a capacity of `slack` times the longest row."""
     with at_once(), own_transfers():
+        _compile_ahead(inputs, options)
         known = engine.count_few(inputs, options)
         longest = int(engine.count_rows(inputs, options=options)[1]) if known is None else int(known.max())
     wanted = math.ceil(max(longest, 1) * slack)

@@ -51,7 +51,7 @@ def pairs_of_search(problem: Problem, inputs: Inputs, summed: bool) -> Pairs:
     fixed = lax.stop_gradient(inputs._replace(sources=hide_inactive(sources, active), active=None))
     relation, several = Searched(fixed, options), isinstance(cutoff, geometry.Radii)
     largest = geometry.make_cutoffs(cutoff, options.closed).largest if isinstance(cutoff, geometry.Radii) else cutoff.radius
-    lattice = _lattice(box, options.images, sources, batch)
+    lattice, sides = _lattice(box, options.images, sources, batch)
     sources, queries = _bring_near(sources, queries, box, options.images, batch)
     unsure = (exclude is not None and exclude.valid is not None) or (batch is not None and batch.fit is not None)
     doubtful = by_data = several or box is not None or unsure
@@ -62,7 +62,7 @@ def pairs_of_search(problem: Problem, inputs: Inputs, summed: bool) -> Pairs:
     if summed and active is None and not by_data:
         return Pairs(relation, False, sources, sources if queries is None else queries, lattice, largest, relation.symmetric, None)
     sources, rows, mark = _prepare_marks(sources, queries, _good_rows_of_search, (inputs,), (options, doubtful))
-    return Pairs(relation, False, sources, rows, lattice, largest, relation.symmetric, mark)
+    return Pairs(relation, False, sources, rows, lattice, largest, relation.symmetric, mark, sides)
 
 
 def pairs_of_list(
@@ -96,7 +96,7 @@ def pairs_of_list(
     relation = _relation_of_list(nbrs, *lax.stop_gradient((sources, rows, box)), symmetric=directionless and not nbrs.half)
     if known is not None and isinstance(relation, Kept):
         relation = dataclasses.replace(relation, given=relation.given._replace(numbers=known.pairs))
-    lattice = _lattice(box, nbrs.box_kind, sources, nbrs.batch)
+    lattice, sides = _lattice(box, nbrs.box_kind, sources, nbrs.batch)
     sources, asking = _bring_near(sources, rows if own else None, box, nbrs.box_kind, nbrs.batch)
     rows = sources if asking is None else asking
     largest = nbrs.cutoff if nbrs.radii is None else geometry.make_cutoffs(lax.stop_gradient(nbrs.radii), nbrs.closed).largest
@@ -104,7 +104,7 @@ def pairs_of_list(
     held = (nbrs.count if isinstance(nbrs, NeighborList) else jnp.diff(nbrs.offsets)) if masked and not own else None
     data, harmless = (nbrs.status, held, fixed_rows), (nbrs._harmless,)
     sources, rows, mark = _prepare_marks(sources, rows if own else None, _good_rows_of_list, data, harmless)
-    sides = None if known is None else known.sides
+    sides = sides if known is None else known.sides
     return Pairs(relation, nbrs.half, sources, rows, lattice, largest, directionless, mark, sides)
 
 
@@ -163,17 +163,27 @@ def _mark_derivatives(points: Array, good: Array) -> Array:
 @_mark_derivatives.defjvp
 def _mark_derivatives_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Any]) -> tuple[Array, Array]:
     points, good = primals
-    return points, tangents[0] * geometry.one_or_nan(good, tangents[0])
+    return points, _mark([tangents[0]], good)[0]
 
 
 def _lattice(
     box: geometry.Box | None, images: geometry.Images | None, like: Array, batch: geometry.Batch | None
-) -> geometry.Lattice | None:
-    """Return the lattice of all pairs or, where each system has a box of its own, of each row."""
+) -> tuple[geometry.Lattice | None, Array | None]:
+    """Return the lattice of all pairs or, where each system has a box of its own, of each row; and its sides if a box is known."""
     if box is None or images is None:
-        return None
-    systems = None if batch is None else batch.of_queries
-    return call_apart(lambda box, systems: lattice_of_rows(box, images, np.dtype(like.dtype), systems, False), box, systems)
+        return None, None
+    systems, dtype = None if batch is None else batch.of_queries, np.dtype(like.dtype)
+    if not any(isinstance(x, Tracer) for x in jax.tree.leaves((box, systems))):
+        return _known_lattice(box, systems, images, dtype)
+    return call_apart(lambda box, systems: lattice_of_rows(box, images, dtype, systems, False), box, systems), None
+
+
+@functools.partial(compile_program, static_argnames=("images", "dtype"))
+def _known_lattice(
+    box: geometry.Box, systems: Array | None, images: geometry.Images, dtype: np.dtype
+) -> tuple[geometry.Lattice, Array]:
+    lattice = lattice_of_rows(box, images, dtype, systems, False)
+    return lattice, geometry.sides_of(lattice)
 
 
 def _bring_near(

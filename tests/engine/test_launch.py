@@ -3,17 +3,18 @@
 import ctypes
 import functools
 import sys
+import threading
 import types
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
 
-from jfrnn._engine import Clear, Launch, Plan, launch, plans
+from jfrnn._engine import Clear, Launch, Plan, launch, plans, start
 from jfrnn._engine.start import load_warp
-from jfrnn.kernels import Field, Kernel, Program, _compile, _driver
+from jfrnn.kernels import Field, Kernel, Program, _clang, _compile, _driver
 from jfrnn.kernels._compile import write_launcher
 
 HEADER = (Path(jax.ffi.include_dir()) / "xla" / "ffi" / "api" / "c_api.h").read_text()
@@ -219,7 +220,7 @@ def test_an_unknown_name_is_asked_for_once_per_device(native):
 def test_programs_that_are_made_ready_ask_and_launch_nothing(native):
     assert native.call("ready@", stage=INSTANTIATE) is None
     assert native.call("ready@", stage=INSTANTIATE, cuda=False) is None
-    assert [device for _, _, device in native.made] == [-2, -1]  # the first one of those that the process uses
+    assert [device for _, _, device in native.made] == [-2, -3]  # for the first device, or the CPU, soon
     assert native.events() == []
 
 
@@ -390,3 +391,60 @@ def test_a_program_for_cuda_that_is_kept_is_loaded_without_warp(monkeypatch, tmp
         _compile.load(Program("broken", "broken", cuda=True), "cuda:1", "start")
     assert started == ["start"] * 3
     assert contexts == []
+
+
+def test_programs_are_compiled_beside_each_other_and_each_once(monkeypatch, tmp_path):
+    """Two compilers wait for each other; a program that is begun twice has one, and is not begun when it is kept."""
+    monkeypatch.setattr(_compile, "_folders", lambda: [tmp_path])
+    work, met, compiled = _clang.compile_object, threading.Barrier(2), []
+
+    def compile_together(text, *given):
+        compiled.append(text)
+        met.wait(60)
+        work(text, *given)
+
+    monkeypatch.setattr(_clang, "compile_object", compile_together)
+    programs = [Program(name, f'extern "C" int {name}() {{ return 1; }}', cuda=False) for name in ("one", "other")]
+    begun = [_compile.begin(program) for program in (*programs, programs[0])]
+    assert begun[0] is begun[2]
+    assert [job.result().stem.split("_")[0] for job in begun] == ["one", "other", "one"]
+    assert len(compiled) == 2
+    assert [_compile.begin(program) for program in programs] == [None, None]
+    assert all(_compile.load(program).address_of(program.name) for program in programs)
+
+
+def test_a_program_that_is_being_made_begins_to_compile_and_its_call_waits(monkeypatch):
+    """A plan is laid when all that it launches is compiled."""
+    job, laid = Future(), []
+    monkeypatch.setattr(
+        launch, "_read_call", lambda name, recipe: (launch.Call("begun", ["x"], {}, lambda *_: "plan"), {"x": (3,)})
+    )
+    monkeypatch.setattr(launch, "begin_programs", lambda plan, device: [job] if not job.done() else [])
+    monkeypatch.setattr(launch, "lay_plan", lambda *given: laid.append(given) or plans.lay_plan("begun@", Plan([], {}), {}, -1))
+    launch._keep_plan("begun@here@3", "made so", launch._CPU_SOON)
+    assert not laid
+    caller = threading.Thread(target=launch._keep_plan, args=("begun@here@3", "made so", launch._CPU))
+    caller.start()
+    caller.join(0.2)
+    assert caller.is_alive()
+    assert not laid
+    job.set_result(None)
+    caller.join(60)
+    assert [given[:2] for given in laid] == [("begun@here@3", "plan")]
+    launch._open().drop(launch._plans.pop(("begun@here@3", -1)))
+
+
+def test_who_waits_long_for_compilers_is_told_once(monkeypatch, caplog):
+    monkeypatch.setattr(start, "_LONG", 0.05)
+    monkeypatch.setattr(start, "_said", False)
+    for _ in range(2):
+        jobs = [Future(), Future()]
+        threading.Timer(0.5, lambda jobs=jobs: [job.set_result(None) for job in jobs]).start()
+        start.wait_for(jobs)
+        assert all(job.done() for job in jobs)
+    assert [record.getMessage().split(",")[0] for record in caplog.records] == ["jfrnn compiles kernels"]
+    start.wait_for([])
+    failed = Future()
+    failed.set_exception(RuntimeError("does not compile"))
+    with pytest.raises(RuntimeError, match="does not compile"):
+        start.wait_for([failed])

@@ -172,7 +172,7 @@ struct CellWalk : Walk<Query> {
     // Serves the cells that begin among the places [place, chunk_end): a cell belongs to the chunk that holds its first place, but
     // where there is one cell alone, of which each chunk serves its own part. Cells of a row are served together until they hold
     // `TOGETHER` queries, since to copy candidates takes longer than to meet some that are farther away.
-    void serve_chunk(int place, int chunk_end) {
+    JFRNN_APART void serve_chunk(int place, int chunk_end) {
         whole cell[4], other[4];
         real at[3];
         if (!one_cell && place > 0 && place < finite_places) {

@@ -17,6 +17,7 @@ static __device__ __forceinline__ long long thread_index() { return (long long)b
 #define JFRNN_MEMBER
 #define JFRNN_INLINE __attribute__((always_inline))
 #define JFRNN_CALL static __attribute__((noinline))
+#define JFRNN_APART __attribute__((noinline))  // of members: inlined wherever they are called, they would take the compiler seconds
 #define JFRNN_MATH static inline __attribute__((always_inline))
 #define JFRNN_TABLE constexpr
 static inline long long thread_index() { return 0; }

@@ -136,7 +136,7 @@ struct Wide {
 
     // Which of the points in lanes are pairs; a few stay `open`, others are none. This is a call of its own: nothing of it may be
     // computed while denormals are flushed.
-    __attribute__((noinline)) unsigned int decided(const real* q, const vec* p, unsigned int& open) const {
+    JFRNN_APART unsigned int decided(const real* q, const vec* p, unsigned int& open) const {
         unsigned int pairs = sure(q, p, open), left = 0;
         double origin[3];
         for (int k = 0; k < DIM; ++k)

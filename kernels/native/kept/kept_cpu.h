@@ -106,7 +106,7 @@ struct KeptRows : Kept {
             visit(some);
         }
     }
-    __attribute__((noinline)) unsigned int decide(const OwnPoint& own, const KeptSlots& some, unsigned int open) const {
+    JFRNN_APART unsigned int decide(const OwnPoint& own, const KeptSlots& some, unsigned int open) const {
         if constexpr (FLUSHED)
             floats.keep();
         unsigned int pairs = !PLAIN ? 0 : wide.decided(own.q, (const vec*)some.numbers, open);

@@ -7,7 +7,8 @@ typedef void (*Function)(const void* arguments);
 
 enum Kind { ONCE, SHARED, CUDA, CUDA_BESIDE, CLEAR, HUGE_PAGES };  // ONCE: on the CPU, also among launches on CUDA
 
-static constexpr int ON_CPU = -1, ON_FIRST = -2;  // in place of the number of a CUDA device; the first one that a process uses
+// In place of a CUDA device; SOON: a program is being made, most likely for the first device that the process uses.
+static constexpr int ON_CPU = -1, CUDA_SOON = -2, CPU_SOON = -3;
 static constexpr int MOST_ARRAYS = 48, MOST_BYTES = 1024, MOST_WORDS = 1024, MOST_RECORDED = 8, MOST_ASKED = 1024;
 
 struct Step {

@@ -327,8 +327,8 @@ static XLA_FFI_Error* answer(XLA_FFI_CallFrame* frame, bool cuda) {
     if (!executes && frame->stage != XLA_FFI_ExecutionStage_INSTANTIATE)
         return nullptr;
     const XLA_FFI_ByteSpan name = call.text("kernel");
-    if (!executes && cuda) {  // XLA does not say for which device a program is made: most likely for the first one
-        Question question = {name, call.text("recipe"), ON_FIRST};
+    if (!executes) {  // XLA does not say for which device a program is made
+        Question question = {name, call.text("recipe"), cuda ? CUDA_SOON : CPU_SOON};
         return question.succeeds() ? nullptr : question.fail(call);
     }
     const int device = cuda ? call.device() : ON_CPU;
@@ -340,10 +340,10 @@ static XLA_FFI_Error* answer(XLA_FFI_CallFrame* frame, bool cuda) {
         plan = enter(name, device);
     }
     XLA_FFI_Error* error = nullptr;
-    if (executes && cuda) {
+    if (cuda) {
         const int wrong = Work(call, *plan, call.stream()).run_on_cuda();
         error = wrong ? call.fail_at("a launch failed with CUDA's error ", wrong) : nullptr;
-    } else if (executes)
+    } else
         Work(call, *plan, nullptr).run_on_cpu();
     leave(plan);
     return error;

@@ -72,7 +72,7 @@ struct RowsBy : Way<RowsBy<Way>>, RowsOut {
     }
 
     // Writes `hits` ids from `row` into the slots of a row from `from` on, and behind the last ones the fill value.
-    void write_row(int id, int from, int hits, bool last) {
+    JFRNN_APART void write_row(int id, int from, int hits, bool last) {
         const long long begin = row_begin(starts, id, capacity);
         int* const out = idx + begin;
         const int room = row_room(starts, id, capacity), stop = from + hits < room ? from + hits : room;

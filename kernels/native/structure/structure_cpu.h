@@ -6,8 +6,6 @@
 #pragma once
 #include "exact.h"
 
-#define JFRNN_APART __attribute__((noinline))  // else each call is inlined, which takes the compiler seconds
-
 struct StructureArguments {
     const real *positions, *cell, *cutoffs;
     const int *periodic, *species;

@@ -162,7 +162,7 @@ struct Largest {
             summand_of[held][k] = Math::select(pairs, summand[k], Math::of(-Bits::not_finite()));
         ++held;
     }
-    __attribute__((noinline)) void settle() {
+    JFRNN_APART void settle() {
         for (int k = 0; k < SUMMANDS; ++k) {
             number largest = summand_of[0][k];
             unsigned int strange = 0;  // lanes where there is NaN

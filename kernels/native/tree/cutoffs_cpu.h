@@ -31,7 +31,7 @@ struct CutoffSort : TreeSortArguments {
         if (!sort_by_cells())
             tree();
     }
-    __attribute__((noinline)) void tree() { TreeSort(*this).build(); }
+    JFRNN_APART void tree() { TreeSort(*this).build(); }
 
     // Returns whether cells are as good as a tree; only then all is sorted by them.
     bool sort_by_cells() {

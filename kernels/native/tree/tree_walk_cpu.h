@@ -64,7 +64,7 @@ struct TreeWalk : Walk<Query> {
     }
     // Copies the sources of those nodes [from, to) of a level that are near a box, and of the system. Leaves that follow each other
     // are copied together.
-    __attribute__((noinline)) void descend(const Box& box, int level, int from, int to) {
+    JFRNN_APART void descend(const Box& box, int level, int from, int to) {
         const int first = this->first[level];
         const int size = level > 0 ? size_of(level - 1) : 1;
         for (int node = from; node < to; node += LANES) {
@@ -129,7 +129,7 @@ struct TreeWalk : Walk<Query> {
         return low;
     }
 
-    void serve_chunk(int place, int chunk_end) {
+    JFRNN_APART void serve_chunk(int place, int chunk_end) {
         const int finite_end = chunk_end < finite_places ? chunk_end : finite_places;
         read_queries(place, finite_end);
         bool known = false;

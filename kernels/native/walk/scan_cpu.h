@@ -269,7 +269,7 @@ struct Scan : SearchArguments, SystemCells, SourcePlaces {
     }
     // Collects the numbers of what is unsure among `count` candidates in `doubtful`, and returns how many there are. Loops are of
     // known length: what would be a branch per vector is hard to predict.
-    int collect_doubtful(int count) {
+    JFRNN_APART int collect_doubtful(int count) {
         const ints numbers = first_numbers();
         const int vectors = (count + LANES - 1) / LANES;
         for (int e = vectors; e < vectors + LANES; ++e)

@@ -81,7 +81,7 @@ struct Walk : Scan {
     unsigned int system_at(int place) const { return BATCHED ? system_of(queries + (long long)ROW * query_ids[place]) : 0u; }
 
     // Lets all candidates meet the queries of the cell, and forgets them.
-    __attribute__((noinline)) void flush(bool finished) {
+    JFRNN_APART void flush(bool finished) {
         for (int e = 0; e < LANES; ++e)
             for (int k = 0; k < DIM; ++k)
                 candidate[k][filled + e] = __builtin_nanf("");
@@ -109,7 +109,7 @@ struct Walk : Scan {
 
     // Copies those of the sources at places [from, to) that may be near one of the queries: others are too far from the box around
     // these. Rounding is monotone, so that no query is nearer to a source, by `square_of`, than the nearest point of the box is.
-    void copy(const Box& box, int from, int to) {
+    JFRNN_APART void copy(const Box& box, int from, int to) {
         for (; from < to; from += LANES) {
             if (filled > CANDIDATES - LANES)
                 flush(false);
