@@ -61,21 +61,36 @@ def cache_folder() -> Path:
 
 
 @functools.cache
+def core_library() -> ctypes.CDLL:
+    """Return the native code of Warp, which is loaded, and of which nothing is started.
+
+    Raises:
+        RuntimeError: It cannot be loaded.
+    """
+    return _load(_NAMES.get(sys.platform, _LINUX)[0])
+
+
+def _load(name: str) -> ctypes.CDLL:
+    folder = warp_root() / "bin"
+    if sys.platform == "win32":
+        os.add_dll_directory(str(folder))
+    try:
+        return ctypes.CDLL(str(folder / name), winmode=0)
+    except OSError as error:
+        raise RuntimeError(f"the compiler that Warp ships cannot be loaded: {error}") from error
+
+
+@functools.cache
 def library() -> ctypes.CDLL:
-    """Return Warp's compiler, which is loaded.
+    """Return Warp's compiler for the CPU, which is loaded.
 
     Raises:
         RuntimeError: This Warp has none, or it does not start.
     """
-    folder, (core_name, name) = warp_root() / "bin", _NAMES.get(sys.platform, _LINUX)
-    if not (folder / name).exists():
+    name = _NAMES.get(sys.platform, _LINUX)[1]
+    if not (warp_root() / "bin" / name).exists():
         raise RuntimeError("this Warp was built without its CPU compiler")
-    if sys.platform == "win32":
-        os.add_dll_directory(str(folder))
-    try:
-        core, clang = (ctypes.CDLL(str(folder / file), winmode=0) for file in (core_name, name))
-    except OSError as error:
-        raise RuntimeError(f"the compiler that Warp ships cannot be loaded: {error}") from error
+    core, clang = core_library(), _load(name)
     core.wp_cpu_block_runtime_get_api.restype = ctypes.c_void_p
     clang.wp_compile_cpp.argtypes = _COMPILED_WITH
     clang.wp_load_obj.argtypes = (_TEXT, _TEXT, _FLAG)

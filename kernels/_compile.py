@@ -13,7 +13,6 @@ import os
 import platform
 import re
 import shutil
-import sys
 import tempfile
 import threading
 import weakref
@@ -21,10 +20,9 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
 from contextlib import contextmanager
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
-from jfrnn.kernels import _clang, _driver, _jobs
+from jfrnn.kernels import _clang, _driver, _jobs, _nvrtc
 from jfrnn.kernels._jobs import one_at_a_time
 from jfrnn.kernels._program import Program
 from jfrnn.kernels._text import resolve
@@ -35,7 +33,6 @@ _END = b"\n//"  # a comment of PTX, and nothing to objects
 _DIGEST = 64  # hexadecimal digits
 _ROOM = 1 << 22  # bytes that a compiler may need
 _ATTEMPTS = 10
-Start = Callable[[], Any]
 Build = Callable[[Program, Path], Path]
 # What C's own headers give to that of XLA.
 _TYPES = """typedef __SIZE_TYPE__ size_t;
@@ -55,8 +52,8 @@ _loaded: weakref.WeakValueDictionary[tuple[Program, str], "Library"] = weakref.W
 class Library:
     """A program that is loaded on a device; it is unloaded when nothing refers to it any longer."""
 
-    def __init__(self, program: Program, device: str, start: Start) -> None:
-        self._program, self._start = program, start
+    def __init__(self, program: Program, device: str) -> None:
+        self._program = program
         self._device = _driver.find_device(int(device.partition(":")[2])) if program.cuda else None
         self._handle = self._load()
         weakref.finalize(self, _unload, self._unloading()).atexit = False  # programs may still run while the interpreter exits
@@ -76,11 +73,11 @@ class Library:
         return found
 
     def _load(self) -> Handle:
-        path = find_binary(self._program, self._device, start=self._start)
+        path = find_binary(self._program, self._device)
         found = self._take(path)
         if not found:
             path.unlink(missing_ok=True)
-            found = self._take(find_binary(self._program, self._device, start=self._start))
+            found = self._take(find_binary(self._program, self._device))
         if not found:
             raise RuntimeError(f"the compiled program {path} cannot be loaded")
         return found
@@ -96,20 +93,12 @@ class Library:
         return functools.partial(_clang.unload_object, self._handle)
 
 
-def _start_warp() -> ModuleType:
-    import warp
-
-    warp.init()
-    return warp
-
-
-def load(program: Program, device: str = "cpu", start: Start = _start_warp) -> Library:
+def load(program: Program, device: str = "cpu") -> Library:
     """Return a program that is loaded on a device; it is compiled where no whole file of it is kept.
 
     Args:
         program: What is loaded.
         device: As Warp names it.
-        start: Imports Warp and starts it, which it takes to compile a program for CUDA.
 
     Raises:
         RuntimeError: It does not compile, or cannot be loaded.
@@ -117,21 +106,19 @@ def load(program: Program, device: str = "cpu", start: Start = _start_warp) -> L
     with one_at_a_time:
         found = _loaded.get((program, device))
         if found is None:
-            found = _loaded[program, device] = Library(program, device, start)
+            found = _loaded[program, device] = Library(program, device)
         return found
 
 
-def begin(program: Program, device: str = "cpu", start: Start = _start_warp) -> Future[Path] | None:
+def begin(program: Program, device: str = "cpu") -> Future[Path] | None:
     """Let another thread compile a program, beside others, if no whole file of it is kept; return what waits for that, or None.
 
     Not for a thread that holds `one_at_a_time`. Arguments and errors are those of `load`; the latter come when it is waited for.
     """
     found = _driver.find_device(int(device.partition(":")[2])) if program.cuda else None
-    name, build = _name(program, found, None), _builder(program, found, None, start)
+    name, build = _name(program, found, None), _builder(program, found, None)
     if _is_whole(kernel_folder() / _FOLDER / name):
         return None
-    if program.cuda:
-        start()
     return _jobs.begin((kernel_folder(), name), functools.partial(_make, program, build, name))
 
 
@@ -167,20 +154,17 @@ def launcher(header: str) -> Program:
     return Program("launch", write_launcher(header), cuda=False, inlined=False)  # it has no loop over pairs, and is waited for
 
 
-def find_binary(
-    program: Program, device: _driver.CudaDevice | None = None, arch: int | None = None, start: Start = _start_warp
-) -> Path:
+def find_binary(program: Program, device: _driver.CudaDevice | None = None, arch: int | None = None) -> Path:
     """Return a file that holds the compiled program, whole.
 
     Args:
         program: What is compiled.
         device: For CUDA, a device.
         arch: The architecture in place of a device, as in 90; then PTX is made.
-        start: As in `load`.
     """
     name = _name(program, device, arch)
     kept = kernel_folder() / _FOLDER / name
-    return kept if _is_whole(kept) else _make(program, _builder(program, device, arch, start), name)
+    return kept if _is_whole(kept) else _make(program, _builder(program, device, arch), name)
 
 
 def _name(program: Program, device: _driver.CudaDevice | None, arch: int | None) -> str:
@@ -190,10 +174,10 @@ def _name(program: Program, device: _driver.CudaDevice | None, arch: int | None)
     return f"{program.name[:80]}_{key}{target[0]}"
 
 
-def _builder(program: Program, device: _driver.CudaDevice | None, arch: int | None, start: Start) -> Build:
+def _builder(program: Program, device: _driver.CudaDevice | None, arch: int | None) -> Build:
     """Return what compiles a program to a file beside its source."""
     if program.cuda:
-        return functools.partial(_build_cuda, start, device, arch)
+        return functools.partial(_build_cuda, device, arch)
     return functools.partial(_build_object, _clang.OPTIONS if program.inlined else (*_clang.OPTIONS, *_clang.APART))
 
 
@@ -227,18 +211,13 @@ def temporary_folder() -> str:
 
 
 def _target(program: Program, device: _driver.CudaDevice | None, arch: int | None) -> tuple[str, str]:
-    """Return the kind of file, and what it runs on: objects use all instructions of the processor that compiles them.
-
-    From the device, the driver, and what users ask of Warp, Warp decides whether a program becomes a cubin or PTX.
-    """
+    """Return the kind of file, and what it runs on: objects use all instructions of the processor that compiles them."""
     if not program.cuda:
         return ".o", " ".join((*_clang.OPTIONS, _processor()))
     if arch is not None:
         return ".ptx", str(arch)
     assert device is not None
-    config = getattr(sys.modules.get("warp"), "config", None)
-    asked = [getattr(config, key, None) for key in ("cuda_output", "ptx_target_arch")]
-    return ".cuda", f"{device.arch} {_driver.version()} {asked}"
+    return ".cuda", f"{device.arch} {_driver.version()}"
 
 
 @functools.cache
@@ -256,17 +235,14 @@ def _build_object(options: Sequence[str], program: Program, source: Path) -> Pat
     return binary
 
 
-def _build_cuda(start: Start, device: _driver.CudaDevice | None, arch: int | None, program: Program, source: Path) -> Path:
-    """Compile a program by Warp, which knows from the name of the file whether PTX is asked for."""
-    warp, kind = start(), "ptx"
-    from warp._src.build import build_cuda
-
-    if arch is None and device is not None:
-        target = warp.get_device(f"cuda:{device.number}")
-        kind, arch = target.get_cuda_output_format(), target.get_cuda_compile_arch()
-    binary = source.with_suffix(f".{kind}")
-    options = {"config": "release", "fuse_fp": program.fused, "use_precompiled_headers": False, "pch_dir": None}
-    build_cuda(str(source), arch, str(binary), **options)
+def _build_cuda(device: _driver.CudaDevice | None, arch: int | None, program: Program, source: Path) -> Path:
+    """Compile for a device, to PTX if NVRTC does not know it yet; or to PTX for an architecture in its place."""
+    known, asked = _nvrtc.known_archs(), device.arch if arch is None and device is not None else arch or 0
+    fitting = [each for each in known if each <= asked]
+    if not fitting:
+        raise RuntimeError(f"the compiler that Warp ships knows the compute capabilities {list(known)}, none of which fits {asked}")
+    binary = source.with_suffix(".cubin" if arch is None and fitting[-1] == asked else ".ptx")
+    _nvrtc.compile_cuda(program.text, source.name, binary, fitting[-1], program.fused)
     return binary
 
 

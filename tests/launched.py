@@ -4,13 +4,11 @@ import ctypes
 
 import numpy as np
 
-from jfrnn._engine.start import load_warp
 from jfrnn.kernels import _compile
 
 
 def on_cpu(kernel, **given):
     """Call a kernel of the CPU once: arrays of NumPy and integers are its arguments, by name."""
-    load_warp()
     assert {field.name for field in kernel.fields} == set(given)
     packed = kernel.pack({name: value.ctypes.data if isinstance(value, np.ndarray) else value for name, value in given.items()})
     library = _compile.load(kernel.program)

@@ -12,7 +12,7 @@ from concurrent.futures import Future
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from jfrnn._engine.start import compiler, load_warp, warn_of_folders
+from jfrnn._engine.start import compiler, warn_of_folders
 from jfrnn.kernels import Kernel, Program, _driver
 from jfrnn.kernels._native import EXCLUDED, TABLE
 
@@ -98,7 +98,7 @@ def begin_programs(plan: Plan, device: int) -> list[Future[Path]]:
     """Let threads compile what a plan launches on a device, and no file keeps; return what waits for them."""
     # what is launched last takes longest to compile
     programs = dict.fromkeys(step.kernel.program for step in reversed(plan.steps) if isinstance(step, Launch))
-    begun = [compiler().begin(program, _place(program, device), load_warp) for program in programs]
+    begun = [compiler().begin(program, _place(program, device)) for program in programs]
     return [job for job in begun if job is not None]
 
 
@@ -259,7 +259,7 @@ def _lay_step(plan: Plan, places: dict[str, int], device: int, held: list[Any], 
     arrays = [field for field in kernel.fields if field.is_array and field.name not in left_out]
     pairs = [number for field in arrays for number in (field.place, places[field.name])]
     given = kernel.pack(numbers)
-    library = compiler().load(kernel.program, place := _place(kernel.program, device), load_warp)
+    library = compiler().load(kernel.program, place := _place(kernel.program, device))
     template, places_of_arrays = (ctypes.c_ubyte * len(given)).from_buffer(given), (ctypes.c_int * len(pairs))(*pairs)
     held += [library, template, places_of_arrays]
     return _Step(

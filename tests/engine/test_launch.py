@@ -13,8 +13,7 @@ import numpy as np
 import pytest
 
 from jfrnn._engine import Clear, Launch, Plan, launch, plans, start
-from jfrnn._engine.start import load_warp
-from jfrnn.kernels import Field, Kernel, Program, _clang, _compile, _driver
+from jfrnn.kernels import Field, Kernel, Program, _clang, _compile, _driver, _nvrtc
 from jfrnn.kernels._compile import write_launcher
 
 HEADER = (Path(jax.ffi.include_dir()) / "xla" / "ffi" / "api" / "c_api.h").read_text()
@@ -124,7 +123,6 @@ class Native:
     cuda = True  # as the program of what is launched
 
     def __init__(self):
-        load_warp()
         self.library = _compile.load(Program("harness", write_launcher(HEADER) + HARNESS, cuda=False))
         self.made, self.refused, self.laid = [], None, {}
         self.make_plan = _MAKE_PLAN(self.make)
@@ -160,7 +158,7 @@ class Native:
             self.laid[name, device] = plans.lay_plan(name, plan, ["x", "y"], device)
         self.desk.keep(self.laid[name, device])
 
-    def load(self, program, device, start):
+    def load(self, program, device):
         assert program is (self if device.startswith("cuda") else HOST) or device == "cpu"
         return self.library
 
@@ -365,31 +363,35 @@ def make_driver(loaded, contexts):
     )
 
 
-def test_a_program_for_cuda_that_is_kept_is_loaded_without_warp(monkeypatch, tmp_path):
-    """Warp is started to compile alone: where nothing is kept, or what is kept cannot be loaded."""
-    loaded, contexts, started = [], [], []
+def test_a_program_for_cuda_that_is_kept_is_not_compiled_again(monkeypatch, tmp_path):
+    """NVRTC is asked where nothing is kept, or what is kept cannot be loaded: for the device, or for PTX that is near to it."""
+    loaded, contexts, compiled = [], [], []
     driver = make_driver(loaded, contexts)
     monkeypatch.setattr(_driver, "driver", lambda: driver)
     monkeypatch.setattr(_compile, "_folders", lambda: [tmp_path])
     monkeypatch.setattr(_driver, "find_device", _driver.find_device.__wrapped__)
 
-    def build(start, device, arch, program, source):
-        started.append(start)
-        assert (device, arch) == (_driver.CudaDevice(1, 0x100, 90, 132), None)
-        source.with_suffix(".ptx").write_text(program.text)
-        return source.with_suffix(".ptx")
+    def compile_cuda(text, name, target, arch, fused):
+        compiled.append((target.suffix, arch))
+        target.write_text(text)
 
-    monkeypatch.setattr(_compile, "_build_cuda", build)
+    monkeypatch.setattr(_nvrtc, "compile_cuda", compile_cuda)
     program = Program("kept", ".entry kept(", cuda=True)
     for _ in range(2):
-        library = _compile.load(program, "cuda:1", "start")
+        library = _compile.load(program, "cuda:1")
         assert library.address_of("twelve chars") == 0x20C
         del library
-    assert started == ["start"]
+    assert compiled == [(".cubin", 90)]
     assert loaded == [(b".entry kept(", [0x100])] * 2
     with pytest.raises(RuntimeError, match="cannot be loaded"):
-        _compile.load(Program("broken", "broken", cuda=True), "cuda:1", "start")
-    assert started == ["start"] * 3
+        _compile.load(Program("broken", "broken", cuda=True), "cuda:1")
+    monkeypatch.setattr(_nvrtc, "known_archs", lambda: (75, 80))
+    with pytest.raises(RuntimeError, match="cannot be loaded"):
+        _compile.load(Program("broken", "broken of the future", cuda=True), "cuda:1")
+    assert compiled == [(".cubin", 90)] * 3 + [(".ptx", 80)] * 2
+    monkeypatch.setattr(_nvrtc, "known_archs", tuple)
+    with pytest.raises(RuntimeError, match=r"knows the compute capabilities \[\], none of which fits 90"):
+        _compile.load(Program("none", "none", cuda=True), "cuda:1")
     assert contexts == []
 
 

@@ -5,7 +5,6 @@ import re
 import pytest
 from checked import refuses
 
-from jfrnn._engine.start import load_warp
 from jfrnn.kernels import Field, _compile, declare
 from jfrnn.kernels._program import read_fields
 
@@ -25,7 +24,6 @@ def test_arguments_are_those_that_a_compiler_finds():
     assert {field.name: field.is_array for field in fields} == {name: bool(kind) for name, kind in kinds.items()}
     assert size == 72
     (kernel,) = declare("reading", "using real = double;\n" + text + KERNEL.format(), "Work.run")
-    load_warp()
     assert _compile.load(kernel.program).address_of("Work_run")  # the compiler has confirmed places and sizes
 
 
@@ -33,7 +31,6 @@ def test_arguments_that_are_derived_stand_behind_those_of_their_bases():
     text = struct("real* a;", "int n;") + struct("int *b, m;").replace("Work", "Other")
     text += "struct Both : WorkArguments, OtherArguments {};\nstruct More : WorkArguments {\n    int* c;\n};\n"
     assert [field[:2] for field in read_fields(text, "Both")[0]] == [("a", 0), ("n", 8), ("b", 16), ("m", 24)]
-    load_warp()
     for given in ("Both", "More"):
         kernel_text = KERNEL.format().replace("WorkArguments", given)
         (kernel,) = declare("derived", "using real = double;\n" + text + kernel_text, "Work.run")
@@ -58,7 +55,6 @@ def test_the_compiler_refuses_arguments_that_were_not_read():
     text = struct("int n;", "void run() {}", "int *hidden;")
     assert read_fields(text, "WorkArguments") == ((Field("n", 0, False),), 8)
     (kernel,) = declare("hidden", text + KERNEL.format(), "Work.run")
-    load_warp()
     refuses(RuntimeError, "does not compile", _compile.load, kernel.program)
 
 

@@ -20,7 +20,6 @@ from jax import numpy as jnp
 from translated import Case, kernel_of, run
 from translated_cases import CASES, ELEMENTWISE, INTEGERS, PAIRS, N
 
-from jfrnn._engine.start import load_warp
 from jfrnn._sums import translate as _translate
 from jfrnn._sums.primitives import TABLE
 from jfrnn._sums.scalars import NoTranslationError, literal
@@ -227,7 +226,6 @@ def test_key_is_the_same_in_every_process():
 
 @pytest.mark.parametrize("real", ["float32", slow("float64")])
 def test_cases_compile_for_cuda(real):
-    load_warp()
     kernel = kernel_of([*ELEMENTWISE.values(), *INTEGERS.values(), *PAIRS.values()], real, "scalar", "cuda", cuda=True)
     assert f".entry {kernel.name}(" in _compile.find_binary(kernel.program, arch=90).read_text()
 

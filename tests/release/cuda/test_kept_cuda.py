@@ -3,7 +3,6 @@
 import pytest
 from checked import slow
 
-from jfrnn._engine.start import load_warp
 from jfrnn.kernels import Kind, _compile, kept, reverse
 from jfrnn.kernels.kept import ListKind
 from jfrnn.kernels.pair_sum_cpu import Step, Sum, TermText, Value
@@ -20,7 +19,6 @@ KINDS = [
 
 
 def compiles(kernel):
-    load_warp()
     return f".entry {kernel.name}(" in _compile.find_binary(kernel.program, "cpu", arch=90).read_text()
 
 

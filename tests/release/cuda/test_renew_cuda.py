@@ -148,7 +148,6 @@ def test_a_search_is_given_what_another_one_is(dim, dtype, boxed, spread):
 
 @pytest.mark.parametrize(("dim", "dtype", "boxed"), KINDS)
 def test_kernels_compile_for_a_gpu(dim, dtype, boxed):
-    launched.load_warp()
     for ordered in (False, True):
         check = renew.renew_kernels(dim, dtype is np.float64, boxed, ordered, constants_of(dtype is np.float64)).check
         assert ".entry Renew_keep(" in _compile.find_binary(check.program, arch=90).read_text()

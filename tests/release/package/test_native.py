@@ -10,7 +10,6 @@ import pytest
 from places import ROOT
 
 from jfrnn._engine import ffi
-from jfrnn._engine.start import load_warp
 from jfrnn.kernels import Program, _compile
 from jfrnn.kernels._compile import write_launcher
 from jfrnn.kernels._text import resolve
@@ -60,7 +59,6 @@ def text_of(header):
 @pytest.mark.parametrize("cuda", [False, True], ids=["cpu", "cuda"])
 def test_headers_compile_by_themselves(cuda):
     assert len(headers(cuda)) >= 30
-    load_warp()
     for name in headers(cuda):
         assert _compile.find_binary(Program(f"header_{name}", text_of(name), cuda), arch=90).exists()
 
