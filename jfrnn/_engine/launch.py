@@ -28,7 +28,7 @@ from jax import Array
 
 from jfrnn._engine.ffi import CallFrame
 from jfrnn._engine.plans import MOST_WORDS, Desk, LaidPlan, Plan, begin_programs, lay_plan, multiprocessors_of, open_desk
-from jfrnn._engine.start import alone, apart, compiler, wait_for, warn_of_folders
+from jfrnn._engine.start import alone, apart, compiler, finish, wait_for, warn_of_folders
 from jfrnn.kernels import Program, one_at_a_time
 
 TARGET = "jfrnn"  # what programs call; jax.export wants to be told that it stays
@@ -250,8 +250,7 @@ _behind_desk = _MakePlan(_make_plan)
 
 def _open() -> Desk:
     """Compile the native code, once, and lead all calls there."""
-    begun = _begun()
-    wait_for([] if begun is None else [begun])
+    finish(_begun)
     return _opened()
 
 

@@ -138,6 +138,16 @@ def wait_for(begun: Iterable[Future[Any]]) -> None:
         job.result()
 
 
+def finish(begin: Any) -> None:  # noqa: ANN401
+    """Wait for what a cached function has begun, if anything; where that has failed, it begins anew next time."""
+    begun = begin()
+    try:
+        wait_for([] if begun is None else [begun])
+    except BaseException:
+        begin.cache_clear()
+        raise
+
+
 def warn_of_folders() -> None:
     """Warn of a folder in which programs cannot be kept."""
     notes = compiler().notes

@@ -6,13 +6,15 @@ import struct
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Collection
+from concurrent.futures import Future
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
 from jfrnn._engine.problem import Inputs, Options
-from jfrnn._engine.start import compiler, wait_for, warn_of_folders
+from jfrnn._engine.start import compiler, finish, warn_of_folders
 from jfrnn._geometry import Box, Cutoff
 from jfrnn.kernels.structure import INTS_PER_ATOM, MORE_INTS, REALS_PER_ATOM, RULES, WRONG, structure_kernel
 
@@ -99,17 +101,17 @@ _SAYS = {
 }
 
 
-def begin_to_count() -> None:
-    """Let another thread compile the kernel, if no file of it is kept."""
-    compiler().begin(structure_kernel().program)
+@functools.cache
+def begin_to_count() -> Future[Path] | None:
+    """Let another thread compile the kernel; return what waits for it, or None if a file of it is kept."""
+    return compiler().begin(structure_kernel().program)
 
 
 @functools.cache
 def _function() -> tuple[Callable[[bytes], Any], struct.Struct, Any]:
     """Return what runs the kernel, given the bytes of its arguments, how these are packed, and what has to live as long."""
     kernel = structure_kernel()
-    begun = compiler().begin(kernel.program)
-    wait_for([] if begun is None else [begun])
+    finish(begin_to_count)
     library = compiler().load(kernel.program)
     warn_of_folders()
     pointers = sum(field.is_array for field in kernel.fields)

@@ -244,7 +244,6 @@ def _compile_ahead(inputs: engine.Inputs, options: engine.Options) -> None:
         return
     _ahead = True
     if engine.begins_cold():
-        engine.begin_to_count()
         find_fields.lower(inputs, options=options, room=_CAPACITY_STEP, moving=False, reversing=False, flat=False).compile()
 
 

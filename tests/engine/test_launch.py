@@ -450,3 +450,15 @@ def test_who_waits_long_for_compilers_is_told_once(monkeypatch, caplog):
     failed.set_exception(RuntimeError("does not compile"))
     with pytest.raises(RuntimeError, match="does not compile"):
         start.wait_for([failed])
+
+
+def test_what_failed_begins_anew():
+    jobs = [Future(), Future()]
+    jobs[0].set_exception(RuntimeError("a full disk"))
+    jobs[1].set_result(None)
+    begin = functools.cache(lambda: jobs.pop(0) if jobs else None)
+    with pytest.raises(RuntimeError, match="a full disk"):
+        start.finish(begin)
+    for _ in range(2):
+        start.finish(begin)
+    assert jobs == []
