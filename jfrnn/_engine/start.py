@@ -122,7 +122,7 @@ def _without_a_word_of_drivers() -> Iterator[None]:
 
 @functools.cache
 def compiler() -> ModuleType:
-    """Return `jfrnn.kernels._compile`, which needs Warp, but imports it for CUDA alone."""
+    """Return `jfrnn.kernels._compile`, which needs the compilers that Warp ships, but does not import it."""
     check_warp()
     return apart(functools.partial(importlib.import_module, "jfrnn.kernels._compile"))
 
