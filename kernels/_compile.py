@@ -122,6 +122,16 @@ def begin(program: Program, device: str = "cpu") -> Future[Path] | None:
     return _jobs.begin((kernel_folder(), name), functools.partial(_make, program, build, name))
 
 
+def can_compile() -> bool:
+    """Say whether there is a compiler for the CPU, and room for it."""
+    try:
+        _clang.library()
+        with _new_folder(kernel_folder()):
+            return True
+    except (OSError, RuntimeError):
+        return False
+
+
 def kernel_folder() -> Path:
     """Return the folder in which programs are kept, and in which Warp may keep its own."""
     return _folders()[-1]

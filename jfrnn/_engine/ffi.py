@@ -5,6 +5,7 @@ import ctypes
 _API_VERSION = (0, 1)
 _METADATA = 1  # the extension that asks for the version
 _INTERNAL_ERROR = 13
+_INSTANTIATE = 0  # the stage of a call
 
 
 class Version(ctypes.Structure):
@@ -43,10 +44,61 @@ class Api(ctypes.Structure):
     )
 
 
+class Text(ctypes.Structure):
+    _fields_ = (("ptr", ctypes.c_void_p), ("len", ctypes.c_size_t))
+
+    def decode(self) -> str:
+        """Return it as a string of Python."""
+        return ctypes.string_at(self.ptr, self.len).decode()
+
+
+class Arrays(ctypes.Structure):
+    """Arrays that are given, or written."""
+
+    _fields_ = (
+        ("struct_size", ctypes.c_size_t),
+        ("extension", ctypes.c_void_p),
+        ("size", ctypes.c_longlong),
+        ("types", ctypes.c_void_p),
+        ("arrays", ctypes.c_void_p),
+    )
+
+
+class Attributes(ctypes.Structure):
+    _fields_ = (
+        ("struct_size", ctypes.c_size_t),
+        ("extension", ctypes.c_void_p),
+        ("size", ctypes.c_longlong),
+        ("types", ctypes.c_void_p),
+        ("names", ctypes.POINTER(ctypes.POINTER(Text))),
+        ("attrs", ctypes.POINTER(ctypes.POINTER(Text))),  # those that are looked at
+    )
+
+
 class CallFrame(ctypes.Structure):
     """The first fields of what XLA hands over with a call."""
 
-    _fields_ = (("struct_size", ctypes.c_size_t), ("extension", ctypes.POINTER(Extension)), ("api", ctypes.POINTER(Api)))
+    _fields_ = (
+        ("struct_size", ctypes.c_size_t),
+        ("extension", ctypes.POINTER(Extension)),
+        ("api", ctypes.POINTER(Api)),
+        ("ctx", ctypes.c_void_p),
+        ("stage", ctypes.c_int),
+        ("args", Arrays),
+        ("rets", Arrays),
+        ("attrs", Attributes),
+    )
+
+    @property
+    def instantiates(self) -> bool:
+        """Whether a program is being made that will call."""
+        return self.stage == _INSTANTIATE
+
+    def text(self, name: str) -> str:
+        """Return a text that a program carries."""
+        given = self.attrs
+        named = {given.names[k].contents.decode(): given.attrs[k] for k in range(given.size)}
+        return named[name].contents.decode()
 
     def tell_version(self) -> bool:
         """Say whether this is no call but a question for the version of the interface, and answer it."""

@@ -17,6 +17,7 @@ import json
 import mmap
 import os
 import platform
+import re
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
 from importlib.resources import files
@@ -155,24 +156,20 @@ _MakePlan = ctypes.CFUNCTYPE(None, *_Text, *_Text, ctypes.c_int, ctypes.c_void_p
 _plans: dict[tuple[str, int], LaidPlan] = {}  # by name and device, those that were made last at the end
 
 
+_COMPILED_BEFORE = (0, 3)  # the latest version of XLA's foreign function interface with which this was tested
 _CPU, _CUDA_SOON, _CPU_SOON = -1, -2, -3  # in place of a CUDA device; SOON: of a program that is made, for the first device
 
 
 def _keep_plan(name: str, recipe: str, device: int) -> None:
     """Let calls find a plan; of a program that is being made, only begin to compile what nobody has compiled yet."""
-    found, shapes = _read_call(name, recipe)
-    desk, made = _open(), device not in (_CUDA_SOON, _CPU_SOON)
-    if device == _CUDA_SOON:
-        device = jax.local_devices(backend="cuda")[0].local_hardware_id  # there may be others, that are not for this process
-    elif device == _CPU_SOON:
-        device = _CPU
+    made, device = device not in (_CUDA_SOON, _CPU_SOON), _number_of(device)
     if (name, device) in _plans:
         return
-    plan = found.plan(shapes, multiprocessors_of(device))
-    begun = begin_programs(plan, device)
+    plan, shapes, begun = _begin_plan(name, recipe, device)
     if begun and not made:
         return
     wait_for(begun)
+    desk = _open()
     with one_at_a_time:
         if (name, device) in _plans:
             return
@@ -181,6 +178,19 @@ def _keep_plan(name: str, recipe: str, device: int) -> None:
             desk.drop(_plans.pop(next(iter(_plans))))
         _plans[name, device] = laid
         desk.keep(laid)
+
+
+def _number_of(device: int) -> int:
+    if device == _CUDA_SOON:
+        return jax.local_devices(backend="cuda")[0].local_hardware_id  # there may be others, that are not for this process
+    return _CPU if device == _CPU_SOON else device
+
+
+def _begin_plan(name: str, recipe: str, device: int) -> tuple[Plan, Shapes, list[Future[Path]]]:
+    """Return a plan, the shapes for which it is made, and what waits for those programs of it that nobody has compiled yet."""
+    found, shapes = _read_call(name, recipe)
+    plan = found.plan(shapes, multiprocessors_of(device))
+    return plan, shapes, begin_programs(plan, device)
 
 
 def _make_plan(name: int, name_size: int, recipe: int, recipe_size: int, device: int, wrong: int) -> None:
@@ -200,7 +210,7 @@ def _describe(error: BaseException) -> str:
 # --- what XLA calls ---------------------------------------------------------------------------------------------------
 
 _Handler = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p)  # address of a call frame -> address of an error, or none
-_PLATFORMS = ("cpu", "CUDA")
+_PLATFORMS = {"cpu": _CPU_SOON, "CUDA": _CUDA_SOON}
 # Instructions that jump to an address that stands behind them, by processor.
 _JUMPS = {"x86_64": b"\xff\x25\x02\x00\x00\x00\x90\x90", "aarch64": b"\x50\x00\x00\x58\x00\x02\x1f\xd6"}
 
@@ -208,7 +218,8 @@ _JUMPS = {"x86_64": b"\xff\x25\x02\x00\x00\x00\x90\x90", "aarch64": b"\x50\x00\x
 class _Door:
     """What XLA is told to call: leads to Python until native code is there, and from then on to that."""
 
-    def __init__(self) -> None:
+    def __init__(self, soon: int) -> None:
+        self._soon = soon  # in place of a device, where a program is made
         # XLA's call becomes that of a class, which changes what it leads to: native code is then called without Python between,
         # on which a handler of a signal could raise
         self._way: Any = type("Way", (), {"__call__": staticmethod(self._enter)})
@@ -234,6 +245,10 @@ class _Door:
         try:
             if frame.tell_version():
                 return None
+            if frame.instantiates and begins_cold():  # what is called compiles beside the native code
+                name, recipe = frame.text("kernel"), frame.text("recipe")
+                apart(lambda: _begin_plan(name, recipe, _number_of(self._soon)))
+                return None
             apart(_open)
             return self._native(address)
         except BaseException as error:
@@ -244,7 +259,7 @@ def _address(function: CFunction) -> int:
     return ctypes.cast(function, ctypes.c_void_p).value or 0
 
 
-_doors = {name: _Door() for name in _PLATFORMS}
+_doors = {name: _Door(soon) for name, soon in _PLATFORMS.items()}
 _behind_desk = _MakePlan(_make_plan)
 
 
@@ -290,11 +305,21 @@ def _opened() -> Desk:
 def open_native() -> None:
     """Compile what stands between XLA and the kernels, if it is not yet there.
 
+    Where that begins in this process, and nothing is known that could keep it from ending, this does not wait: calls do.
+
     Raises:
         RuntimeError: It cannot be compiled.
     """
-    apart(_open)
+    if not (begins_cold() and _will_compile()):
+        apart(_open)
     warn_of_folders()
+
+
+@functools.cache
+def _will_compile() -> bool:
+    """Say whether the native code is sure to compile: a compiler is there, and XLA's interface is one that was compiled before."""
+    known = re.findall(r"^#define XLA_FFI_API_(?:MAJOR|MINOR) (\d+)", _launcher().text, re.MULTILINE)
+    return compiler().can_compile() and (0, 0) < tuple(map(int, known)) <= _COMPILED_BEFORE
 
 
 for _name, _door in _doors.items():

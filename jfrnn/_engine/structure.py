@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from jfrnn._engine.launch import begins_cold
 from jfrnn._engine.problem import Inputs, Options
 from jfrnn._engine.start import compiler, finish, warn_of_folders
 from jfrnn._geometry import Box, Cutoff
@@ -107,6 +108,14 @@ def begin_to_count() -> Future[Path] | None:
     return compiler().begin(structure_kernel().program)
 
 
+def _is_there() -> bool:
+    """Say whether nobody has to wait for the kernel, in a process that was the first to compile any."""
+    if not begins_cold():
+        return True
+    begun = begin_to_count() if begin_to_count.cache_info().currsize else None
+    return begun is not None and begun.done()
+
+
 @functools.cache
 def _function() -> tuple[Callable[[bytes], Any], struct.Struct, Any]:
     """Return what runs the kernel, given the bytes of its arguments, how these are packed, and what has to live as long."""
@@ -127,7 +136,7 @@ def _function() -> tuple[Callable[[bytes], Any], struct.Struct, Any]:
 def count_few(inputs: Inputs, options: Options) -> np.ndarray | None:
     """Return the number of neighbors of each particle, [n] int64; None where a compiled program is to count.
 
-    It counts in plain searches of few concrete particles by an engine whose kernels run here.
+    It counts in plain searches of few concrete particles by an engine whose kernels run here, once the kernel is compiled.
     """
     sources, queries, active, box, cutoff, batch, exclude = inputs
     n = sources.shape[0]
@@ -145,7 +154,7 @@ def count_few(inputs: Inputs, options: Options) -> np.ndarray | None:
     _seen[shape] = times = _seen.pop(shape, 0) + 1
     while len(_seen) > _SHAPES:
         _seen.popitem(last=False)
-    if times > _TIMES:
+    if times > _TIMES or not _is_there():
         return None
     known = [np.asarray(jax.device_get(x)) for x in (sources, *([] if box is None else [box.vectors]))]
     try:

@@ -15,7 +15,7 @@ import numpy as np
 from jax import Array, lax
 
 from jfrnn._engine.boxes_warp import box_neighbors
-from jfrnn._engine.launch import Call, Shapes, begins_cold, kernel, open_native
+from jfrnn._engine.launch import Call, Shapes, kernel, open_native
 from jfrnn._engine.operands import (
     MOST_IN_BOX,
     absent,
@@ -37,7 +37,6 @@ from jfrnn._engine.operands import (
 from jfrnn._engine.plans import Clear, Launch, Plan, share
 from jfrnn._engine.problem import Engine, Features, Filter, Options, Room, Rows, Search, largest_radius
 from jfrnn._engine.start import check_warp
-from jfrnn._engine.structure import begin_to_count
 from jfrnn._geometry import Cutoffs
 from jfrnn._tracing import on_platform
 from jfrnn.kernels import Kernel, Kind, _driver, cells_cpu, cells_cuda, few_cuda, tree_cpu, tree_cuda
@@ -212,8 +211,6 @@ def missing(platform: str) -> str | None:
     try:
         check_warp()
         if platform in PLATFORMS:
-            if begins_cold():
-                begin_to_count()  # as many first searches do
             open_native()
         if platform in ("gpu", "cuda"):
             return None if _driver.device_count() else "there is no CUDA device"

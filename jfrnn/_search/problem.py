@@ -234,25 +234,21 @@ def round_capacity(slots: int) -> int:
     return -(-slots // _CAPACITY_STEP) * _CAPACITY_STEP
 
 
-_ahead = False  # whether the first search of a process has come
-
-
-def _compile_ahead(inputs: engine.Inputs, options: engine.Options) -> None:
-    """Where nothing is compiled yet, compile what lists while others compile what counts: kernels depend on no capacity."""
-    global _ahead
-    if _ahead or not options.engine.native:
-        return
-    _ahead = True
-    if engine.begins_cold():
-        find_fields.lower(inputs, options=options, room=_CAPACITY_STEP, moving=False, reversing=False, flat=False).compile()
-
-
 def count_capacity(inputs: engine.Inputs, options: engine.Options, slack: Real) -> int:
-    """Count the neighbors of concrete positions; return a capacity of `slack` times the longest row."""
+    """Count the neighbors of concrete positions; return a capacity of `slack` times the longest row.
+
+    Where kernels were compiled by no process before, it lists, by the kernels that the list itself needs: those that count would
+    have to be compiled, too.
+    """
     with at_once(), own_transfers():
-        _compile_ahead(inputs, options)
         known = engine.count_few(inputs, options)
-        longest = int(engine.count_rows(inputs, options=options)[1]) if known is None else int(known.max())
+        if known is not None:
+            longest = int(known.max())
+        elif options.engine.native and engine.begins_cold():
+            longest = int(engine.list_rows(inputs, options=options, capacity=1).rows.required)
+            engine.begin_to_count()
+        else:
+            longest = int(engine.count_rows(inputs, options=options)[1])
     wanted = math.ceil(max(longest, 1) * slack)
     return min(round_capacity(wanted), max(wanted, inputs.sources.shape[0]))
 

@@ -82,6 +82,9 @@ MIRRORED = {
     ffi.Version: ("XLA_FFI_Api_Version", {"major": "major_version", "minor": "minor_version", "extension": "extension_start"}),
     ffi.Extension: (EXTENSION, {"metadata": None}),
     ffi.CallFrame: ("XLA_FFI_CallFrame", {"extension": "extension_start"}),
+    ffi.Arrays: ("XLA_FFI_Args", {"extension": "extension_start", "arrays": "args"}),
+    ffi.Attributes: ("XLA_FFI_Attrs", {"extension": "extension_start"}),
+    ffi.Text: ("XLA_FFI_ByteSpan", {}),
     ffi.Api: (
         "XLA_FFI_Api",
         {"extension": "extension_start", "version": "api_version", "internal": "internal_api", "fail": "XLA_FFI_Error_Create"},
