@@ -45,6 +45,7 @@ typedef __UINT64_TYPE__ uint64_t;
 #define offsetof(type, member) __builtin_offsetof(type, member)
 """
 notes: list[str] = []  # what users should be warned of, until they are
+_left: list[Callable[[], None]] = []  # what unloads programs
 _moving = threading.Lock()  # of who finds that programs cannot be kept
 _loaded: weakref.WeakValueDictionary[tuple[Program, str], "Library"] = weakref.WeakValueDictionary()
 
@@ -104,6 +105,8 @@ def load(program: Program, device: str = "cpu") -> Library:
         RuntimeError: It does not compile, or cannot be loaded.
     """
     with one_at_a_time:
+        while _left:
+            _left.pop()()
         found = _loaded.get((program, device))
         if found is None:
             found = _loaded[program, device] = Library(program, device)
@@ -340,5 +343,14 @@ def _is_whole(path: Path) -> bool:
 
 
 def _unload(work: Callable[[], None]) -> None:
-    with one_at_a_time:
-        work()
+    """Unload a program, or leave that to the next who loads one.
+
+    Python gives programs back at any time, also in a thread for which the holder of the lock waits.
+    """
+    if one_at_a_time.acquire(blocking=False):
+        try:
+            work()
+        finally:
+            one_at_a_time.release()
+    else:
+        _left.append(work)

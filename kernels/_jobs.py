@@ -8,10 +8,9 @@ from typing import Any, TypeVar
 
 _MOST = 8  # compilers at once: each takes some 100 MB
 Result = TypeVar("Result")
-# The lock of all that starts, loads and lays plans, one thread at a time. Whoever holds it waits for no job: work may end with what
-# takes it, as when Python gives back a program.
+# The lock of all that starts, loads and lays plans, one thread at a time.
 one_at_a_time = threading.RLock()
-_begins = threading.Lock()
+_begins = threading.RLock()  # a handler of a signal may fork while its thread holds it
 _jobs: dict[Hashable, Future[Any]] = {}
 
 
@@ -20,17 +19,24 @@ def _make_pool() -> ThreadPoolExecutor:
 
 
 def begin(key: Hashable, work: Callable[[], Result]) -> Future[Result]:
-    """Let another thread do work, unless one is at the work of this key; return what waits for it."""
+    """Let another thread do work, unless one is at the work of this key; return what waits for it.
+
+    Where no thread can begin any more, as the main one has ended, this one does it.
+    """
     with _begins:
         job = _jobs.get(key)
-        if job is None or job.done():
-            try:
-                job = _pool.submit(work)
-            except RuntimeError as error:  # the interpreter exits
-                job = Future()
-                job.set_exception(error)
-            _jobs[key] = job
-        return job
+        if job is not None and not job.done():
+            return job
+        try:
+            job = _jobs[key] = _pool.submit(work)
+            return job
+        except RuntimeError:
+            job = _jobs[key] = Future()
+    try:
+        job.set_result(work())
+    except BaseException as error:
+        job.set_exception(error)
+    return job
 
 
 def _hold() -> None:

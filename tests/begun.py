@@ -121,6 +121,17 @@ def end():
     print("ends")
 
 
+def outlive():
+    """Do the first search when the main thread has ended, and no thread can begin any more."""
+
+    def search():
+        threading.main_thread().join()
+        print("right", np.array_equal(jfrnn.count(POINTS, 0.3, backend="warp"), expected))
+
+    expected = jfrnn.count(POINTS, 0.3, backend="brute")
+    threading.Thread(target=search).start()
+
+
 def clear():
     """Compile while another process clears the folder in which kernels are kept."""
     work, folder = _compile._clang.compile_object, _compile.kernel_folder() / _compile._FOLDER
@@ -142,4 +153,5 @@ def fill():
 
 
 warnings.filterwarnings("ignore", message=".*fork")
-{"together": start_together, "fork": fork, "end": end, "clear": clear, "fill": fill}[sys.argv[1]]()
+checks = {"together": start_together} | {check.__name__: check for check in (fork, outlive, end, clear, fill)}
+checks[sys.argv[1]]()

@@ -216,6 +216,8 @@ def what_is_missing_anywhere_is_told():
     assert halo.required.hops.tolist() == [2]
     for given in (halo, None):
         assert int(distributed.count(far, 0.5, halo=given, backend="warp").max()) == np.iinfo(np.int32).min
+    x[1] = [5.0, np.nan]  # nobody's neighbor, wherever it is
+    assert int(distributed.halo(particles.replace(positions=jnp.asarray(x)[ids])).status) == 0
 
 
 @check

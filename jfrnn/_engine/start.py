@@ -132,7 +132,7 @@ def wait_for(begun: Iterable[Future[Any]]) -> None:
     global _said
     ends = time.monotonic() + _LONG
     for job in begun:
-        if not _said and not wait([job], max(ends - time.monotonic(), 0)).done:
+        if not (_said or wait([job], max(ends - time.monotonic(), 0)).done or _said):
             _said = True
             _log.warning("jfrnn compiles kernels, which are kept in %s for later processes", compiler().kernel_folder())
         job.result()

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from jfrnn._engine import Clear, Launch, Plan, launch, plans, start
-from jfrnn.kernels import Field, Kernel, Program, _clang, _compile, _driver, _nvrtc
+from jfrnn.kernels import Field, Kernel, Program, _clang, _compile, _driver, _nvrtc, one_at_a_time
 from jfrnn.kernels._compile import write_launcher
 
 HEADER = (Path(jax.ffi.include_dir()) / "xla" / "ffi" / "api" / "c_api.h").read_text()
@@ -462,3 +462,18 @@ def test_what_failed_begins_anew():
     for _ in range(2):
         start.finish(begin)
     assert jobs == []
+
+
+def test_a_program_that_is_given_back_waits_for_nobody():
+    """Else a thread that compiles, in which Python gives programs back, would wait for one that forks when it has compiled."""
+    unloaded = []
+    with one_at_a_time:
+        thread = threading.Thread(target=_compile._unload, args=(lambda: unloaded.append("left"),))
+        thread.start()
+        thread.join(60)
+        assert not thread.is_alive()
+        assert unloaded == []
+    _compile.load(Program("after", 'extern "C" int after() { return 1; }', cuda=False))
+    assert unloaded == ["left"]
+    _compile._unload(lambda: unloaded.append("at once"))
+    assert unloaded == ["left", "at once"]

@@ -142,6 +142,10 @@ def test_a_compiler_without_room_does_not_end_the_process(tmp_path):
     assert errors == ""
 
 
+def test_a_thread_that_outlives_the_main_one_compiles_by_itself(tmp_path):
+    assert run(BEGUN, "outlive", cache=tmp_path) == (["right True"], "")
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="forks with memory for instructions")
 def test_processes_that_fork_share_no_door_and_leave_no_lock_behind():
     assert begin("fork") == (["led elsewhere 0", "ended 0 0 0 0 0 0"], "")
