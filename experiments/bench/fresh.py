@@ -30,6 +30,7 @@ def read_page(page: str) -> None:
     jax.monitoring.register_event_duration_secs_listener(listen)
     begin = perf_counter()
     exec(compile("\n".join(blocks), page, "exec"), {"__name__": "page"})  # what a reader pastes
+    jax.block_until_ready(jax.live_arrays())  # what is left to be done
     told = {"page_s": perf_counter() - begin, "programs": len(compiled), "compile_s": sum(compiled)}
     print(json.dumps({**told, "platform": device.platform, "device": device.device_kind}))
 
