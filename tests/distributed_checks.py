@@ -221,6 +221,22 @@ def what_is_missing_anywhere_is_told():
 
 
 @check
+def one_function_in_two_boxes_on_two_meshes():
+    """What is traced for a mesh is asked for again, to be translated for other periodic axes, on another one."""
+
+    def pulled(r, i, j):
+        return jnp.exp(-3 * jnp.sum(r * r)) * j
+
+    x = np.random.default_rng(3).uniform(0, 4, (40, 2)).astype(np.float32)
+    for shape, periodic in (((1, 2), (True, False)), ((2,), (False, True))):
+        box = jfrnn.Box([4.0, 4.0], periodic=periodic)
+        particles = distributed.scatter(x, 0.8, x[:, 0], mesh=mesh_of(*shape), box=box)
+        found = distributed.pair_sum(pulled, particles, 0.8, particles.values, backend="warp")
+        alone = jfrnn.pair_sum(pulled, jnp.asarray(x), 0.8, jnp.asarray(x[:, 0]), box=box, backend="jax")
+        np.testing.assert_allclose(by_id(found, particles), alone, rtol=1e-5)
+
+
+@check
 def counts_beside_cuts_that_differ_and_of_strays():
     """Two slabs whose cuts lie far apart, so that ghosts go round a corner, and particles on shards far from where they are."""
     rng, k = np.random.default_rng(13), np.arange(8)

@@ -22,7 +22,7 @@ from jax.core import eval_jaxpr
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, jaxpr_as_fun
 from jax.interpreters import partial_eval
 
-from jfrnn._tracing import Given
+from jfrnn._tracing import Given, without_mesh
 
 
 class Groups(NamedTuple):
@@ -89,12 +89,15 @@ def split_operands(operands: Sequence, like: Groups) -> Groups:
 
 
 def _jaxpr_of(summand: Summand, operands: Groups, shift: jax.ShapeDtypeStruct) -> ClosedJaxpr:
-    """Trace the summand of one pair, with matrix products in full precision, where GPUs would use TF32 by default."""
+    """Trace the summand of one pair, with matrix products in full precision, where GPUs would use TF32 by default.
+
+    Equations remember the mesh under which they were traced, and a term may be asked for again under another one.
+    """
 
     def flat(real: Array, shift: Array, *flat: Array) -> list[Array]:
         return [jnp.asarray(x) for x in summand(real, shift, split_operands(flat, operands))]
 
-    with jax.default_matmul_precision("highest"):
+    with jax.default_matmul_precision("highest"), without_mesh():
         return jax.make_jaxpr(flat)(jax.ShapeDtypeStruct((), np.bool_), shift, *sum(operands, ()))
 
 

@@ -27,5 +27,15 @@ from jfrnn._tracing.arguments import (
     refuse_forks,
 )
 from jfrnn._tracing.flags import Packed, first_set, largest_of, pack_parts, packed_places, set_places
-from jfrnn._tracing.late import call_apart, call_late, lower_late, on_platform, result_aval, unvarying_types, vary, varying_axes
+from jfrnn._tracing.late import (
+    call_apart,
+    call_late,
+    lower_late,
+    on_platform,
+    result_aval,
+    unvarying_types,
+    vary,
+    varying_axes,
+    without_mesh,
+)
 from jfrnn._tracing.programs import compile_program

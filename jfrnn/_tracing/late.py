@@ -105,6 +105,14 @@ def _late() -> Internal:
     return late
 
 
+def without_mesh() -> contextlib.AbstractContextManager[object]:
+    """Trace as where no mesh of devices is set; of older releases of JAX, only where none is."""
+    use = getattr(jax.sharding, "use_abstract_mesh", None)
+    if use is None or jax.sharding.get_abstract_mesh().empty:
+        return contextlib.nullcontext()
+    return use(jax.sharding.AbstractMesh((), ()))
+
+
 def varying_axes(tree: Tree) -> tuple[str, ...]:
     """Return the mesh axes over which any array of a pytree varies."""
     found: set[str] = set()
