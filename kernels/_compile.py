@@ -191,7 +191,12 @@ def _builder(program: Program, device: _driver.CudaDevice | None, arch: int | No
     """Return what compiles a program to a file beside its source."""
     if program.cuda:
         return functools.partial(_build_cuda, device, arch)
-    return functools.partial(_build_object, _clang.OPTIONS if program.inlined else (*_clang.OPTIONS, *_clang.APART))
+    return functools.partial(_build_object, _options(program))
+
+
+def _options(program: Program) -> tuple[str, ...]:
+    """Return the options of Clang for a program."""
+    return _clang.OPTIONS if program.inlined else (*_clang.OPTIONS, *_clang.APART)
 
 
 def _make(program: Program, build: Build, name: str) -> Path:
@@ -226,7 +231,7 @@ def temporary_folder() -> str:
 def _target(program: Program, device: _driver.CudaDevice | None, arch: int | None) -> tuple[str, str]:
     """Return the kind of file, and what it runs on: objects use all instructions of the processor that compiles them."""
     if not program.cuda:
-        return ".o", " ".join((*_clang.OPTIONS, _processor()))
+        return ".o", " ".join((*_options(program), _processor()))
     if arch is not None:
         return ".ptx", str(arch)
     assert device is not None

@@ -23,7 +23,7 @@ from jfrnn._engine.reverse_warp import collect_slots, flatten_slots, reverse_slo
 from jfrnn._engine.rows import add_up, count_rows, find_rows, fold_pairs, length_of_rows, list_flat, list_rows, mark_counts
 from jfrnn._engine.runs import FOLD_GROUP, Block, Slots, Visit
 from jfrnn._engine.start import compiler, level_of_caller
-from jfrnn._engine.structure import Structure, begin_to_count, count_few, find_structure_pairs
+from jfrnn._engine.structure import Structure, count_few, find_structure_pairs
 from jfrnn._engine.sum_results import FoundSums, Summed
 from jfrnn._engine.warp import PLATFORMS, has_order
 from jfrnn._engine.warp_sums import pair_sums

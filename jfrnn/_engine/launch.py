@@ -280,6 +280,7 @@ def _begun() -> Future[Path] | None:
     return compiler().begin(_launcher())
 
 
+@functools.cache
 def begins_cold() -> bool:
     """Begin to compile the native code, while the program that calls it is traced; say whether no file of it was kept.
 

@@ -2,6 +2,7 @@
 
 import ctypes
 import functools
+import itertools
 import struct
 import threading
 from collections import OrderedDict
@@ -28,6 +29,7 @@ _kept = threading.local()
 _MOST = 4096  # particles that are counted by it
 _TIMES = 8  # that a shape comes before it is worth a program
 _SHAPES = 4096  # whose times are counted
+_asks = itertools.count()  # of counts in a process that was the first to compile any
 _seen: "OrderedDict[Any, int]" = OrderedDict()
 
 
@@ -103,24 +105,29 @@ _SAYS = {
 
 
 @functools.cache
-def begin_to_count() -> Future[Path] | None:
+def _begin() -> Future[Path] | None:
     """Let another thread compile the kernel; return what waits for it, or None if a file of it is kept."""
     return compiler().begin(structure_kernel().program)
 
 
 def _is_there() -> bool:
-    """Say whether nobody has to wait for the kernel, in a process that was the first to compile any."""
+    """Say whether a count may take the kernel: where kernels were compiled by no process before, only when it is compiled.
+
+    Who asks first does so in a first search, which waits for others: it begins with the second.
+    """
     if not begins_cold():
         return True
-    begun = begin_to_count() if begin_to_count.cache_info().currsize else None
-    return begun is not None and begun.done()
+    if next(_asks) == 0:
+        return False
+    begun = _begin()
+    return begun is None or begun.done()
 
 
 @functools.cache
 def _function() -> tuple[Callable[[bytes], Any], struct.Struct, Any]:
     """Return what runs the kernel, given the bytes of its arguments, how these are packed, and what has to live as long."""
     kernel = structure_kernel()
-    finish(begin_to_count)
+    finish(_begin)
     library = compiler().load(kernel.program)
     warn_of_folders()
     pointers = sum(field.is_array for field in kernel.fields)

@@ -246,7 +246,6 @@ def count_capacity(inputs: engine.Inputs, options: engine.Options, slack: Real) 
             longest = int(known.max())
         elif options.engine.native and engine.begins_cold():
             longest = int(engine.list_rows(inputs, options=options, capacity=1).rows.required)
-            engine.begin_to_count()
         else:
             longest = int(engine.count_rows(inputs, options=options)[1])
     wanted = math.ceil(max(longest, 1) * slack)

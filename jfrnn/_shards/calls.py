@@ -125,11 +125,12 @@ def gather_seen(particles: Particles, halo: Halo) -> Seen:
 
 def take_halo(particles: Particles, halo: Halo | None) -> tuple[Halo, Array]:
     """Return a halo, made anew without one, and whether it belongs to these rows and no particle is missing in it, [] bool."""
-    if halo is None:
-        made = halo_in_shard(particles)
-        return made, (made.status & OVERFLOWS.value) == 0
-    other = jnp.any(halo.ids[: particles.sizes.particles] != particles.ids)
-    return halo, ~lax.pmax(other, particles.mesh.axis_names) & ((halo.status & OVERFLOWS.value) == 0)
+    found = halo_in_shard(particles) if halo is None else halo
+    good = (found.status & OVERFLOWS.value) == 0
+    if halo is not None:
+        other = jnp.any(halo.ids[: particles.sizes.particles] != particles.ids)
+        good &= ~lax.pmax(other, particles.mesh.axis_names)
+    return found, good
 
 
 @functools.partial(jax.jit, static_argnames="asked")

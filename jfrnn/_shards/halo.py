@@ -126,9 +126,10 @@ def halo_in_shard(particles: Particles) -> Halo:
 def _sum_shards(x: Array, mesh: Mesh) -> Array:
     """Sum nonnegative int32 over all shards, saturating at the largest int32."""
     each = of_all_shards(x, mesh)
-    high, low = jnp.sum(each >> 15), jnp.sum(each & 0x7FFF)  # neither overflows for up to 32 768 shards
+    # neither overflows for up to 32 768 shards
+    high, low = jnp.sum(each >> 15, dtype=jnp.int32), jnp.sum(each & 0x7FFF, dtype=jnp.int32)
     high = high + (low >> 15)
-    return jnp.where(high > 0xFFFF, MOST_PAIRS, (high << 15) | (low & 0x7FFF)).astype(jnp.int32)
+    return jnp.where(high > 0xFFFF, MOST_PAIRS, (high << 15) | (low & 0x7FFF))
 
 
 def exchange(leaf: Array, halo: Halo, particles: Particles) -> Array:

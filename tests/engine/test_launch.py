@@ -477,3 +477,12 @@ def test_a_program_that_is_given_back_waits_for_nobody():
     assert unloaded == ["left"]
     _compile._unload(lambda: unloaded.append("at once"))
     assert unloaded == ["left", "at once"]
+
+
+def test_the_native_code_is_waited_for_where_its_interface_is_a_later_one(monkeypatch):
+    latest = launch._COMPILED_BEFORE
+    for version, sure in (((0, 1), True), (latest, True), ((latest[0], latest[1] + 1), False), ((), False)):
+        lines = [f"#define XLA_FFI_API_{name} {number}" for name, number in zip(("MAJOR", "MINOR"), version, strict=False)]
+        program = Program("launch", "\n".join(lines), cuda=False)
+        monkeypatch.setattr(launch, "_launcher", lambda program=program: program)
+        assert launch._will_compile.__wrapped__() is sure, version
