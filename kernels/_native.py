@@ -8,9 +8,9 @@ positions, their dimension, named integers), the headers that this one includes,
 
 `cutoff`, an array of one scalar, is an argument of all of them. Where space is periodic, the radius in it is followed by the
 lattice: its vectors and the transform, row by row (3 x 3 each); origin, half the width of the stencil in units of the transform,
-images within reach (3 each); slack. Where it is skewed, its vectors as they were given follow, and which whole numbers of those the
-vectors are (3 x 3 each). In a batch, the highest number of a system comes last. Such integers are the bits of a float, or the value
-of a double.
+images within reach (3 each); slack; a bound on the turns of particles. Where it is skewed, its vectors as they were given follow,
+and which whole numbers of those the vectors are (3 x 3 each). In a batch, the highest number of a system comes last. Such integers
+are the bits of a float, or the value of a double.
 """
 
 from collections.abc import Mapping

@@ -3,9 +3,10 @@
 The stages of `jfrnn.kernels.cells_cuda` sort the sources by cell. `sort_values` puts what a term reads of them into the same
 order, a row each. Then the walk of that module finds pairs as a search does, and holds their bits for 22 blocks of candidates. A
 lane goes through the bits of its query and reads the row of each neighbor through the first-level cache, which the 31 other lanes
-share: of a few pairs at a time, while it evaluates the term for those before. In a periodic box turns stand behind what is read of
-i and j, packed as in `jfrnn._box`: with the image of a neighbor they make its lattice shift S. In place of sums it can find the
-largest summands, and whose they are.
+share: of a few pairs at a time, while it evaluates the term for those before. In a periodic box coordinates are those in its
+cell, and the image of a neighbor is its lattice shift S; where particles lie further away than in the boxes beside, rows of
+particles are read, too: their coordinates as they were given, and turns, which S takes account of. In place of sums it can find
+the largest summands, and whose they are.
 
 Where a million particles have 108 neighbors (float32), 32 queries meet 570 candidates near their box. Evaluating the term for all
 of them would take 570 steps of the warp; for the pairs of one block of 32 at a time 345, as lanes wait for the one with most;
@@ -33,8 +34,8 @@ def slots(queries: int) -> int:
 
 
 def sorted_numbers(term: TermText, sources: int, dim: int, double: bool) -> int:
-    """Return how many numbers the sorted values of all sources take."""
-    return sources * row_length(term, dim, double)
+    """Return how many numbers the sorted values of all sources take: rows of particles, if these are read, and rows of values."""
+    return sources * (row_length(term, dim, double) + (4 if term.reads_rows else 0))
 
 
 def row_length(term: TermText, dim: int, double: bool) -> int:
@@ -42,7 +43,7 @@ def row_length(term: TermText, dim: int, double: bool) -> int:
 
     Coordinates come first, where a term reads them and something else.
     """
-    columns = term.source_columns + _placed_columns(term, dim)
+    columns = len(term.other_columns) + _placed_columns(term, dim)
     at_once = 2 if double else 4
     return next((length for length in (0, 1, 2) if columns <= length <= at_once), -(-columns // at_once) * at_once)
 
@@ -62,12 +63,12 @@ class Kernels(NamedTuple):
 
 
 def _reads_positions(term: TermText) -> bool:
-    return any(value.axis is not None for value in term.others)
+    return any(value.axis is not None or value.column_axis is not None for value in term.others)
 
 
 def _placed_columns(term: TermText, dim: int) -> int:
     """Return how many coordinates of j stand before its columns."""
-    return dim if term.source_columns and _reads_positions(term) else 0
+    return dim if term.other_columns and _reads_positions(term) else 0
 
 
 @functools.lru_cache(512)
@@ -80,22 +81,32 @@ def sum_kernels(kind: Kind, term: TermText, key: str) -> Kernels:
     # `taken` is how many pairs a lane adds before it looks for the next block; `blocks` per multiprocessor bound registers. Both
     # are what was fastest on an H200: rows of several loads wait in registers, and are 1.3 times slower if four are loaded ahead.
     length = row_length(term, kind.dim, kind.double)
-    cheap = work(term.text) <= LITTLE_WORK and length <= 4
+    cheap = work(term.unshifted or term.text) <= LITTLE_WORK and length <= 4
     blocks = 16 if kind.double or not cheap else 20
-    from_places = _reads_positions(term) and not term.source_columns
-    constants = {**GRID, **constants_of(term, kind), "LIST": 0, "LATER": 0, "TAKEN": 4 if cheap else 2, "FROM_PLACES": from_places}
+    from_places = _reads_positions(term) and not term.other_columns
+    constants = {
+        **GRID,
+        **constants_of(term, kind, by_rows=True),
+        "LIST": 0,
+        "LATER": 0,
+        "TAKEN": 4 if cheap else 2,
+        "FROM_PLACES": from_places,
+    }
     constants |= {"ROW_LENGTH": max(length, 1), "PLACED": _placed_columns(term, kind.dim)}
+    constants |= {"COLUMNS": len(term.other_columns), "READS_ROWS": term.reads_rows}
 
     declare_one = functools.partial(declare_kind, kind.compiled(), cuda=True)
 
     def query_kernel(name: str, crossing: bool = False) -> Kernel:
         entry = Entry("Sums.run", QUERY_BLOCK, blocks, "Sums_cross" * crossing)
-        given = term_header(term, kind.double)
+        given = term_header(term, kind.double, by_rows=True)
         return declare_one(f"{name}_{key}", "pair_sum.cuh", entry, given=given, constants=constants | {"CROSSING": crossing})[0]
 
     sorting = Entry("SortValues.run", QUERY_BLOCK, 32)
     return Kernels(
-        declare_one(f"sort_values_{key}", "sort_values.cuh", sorting, constants=constants)[0] if term.source_columns else None,
+        declare_one(f"sort_values_{key}", "sort_values.cuh", sorting, constants=constants)[0]
+        if term.other_columns or term.reads_rows
+        else None,
         query_kernel("pair_sum", crossing=kind.tree and kind.periodic > 0),
         query_kernel("crossing_pair_sum", crossing=True) if kind.periodic and not kind.tree else None,
     )

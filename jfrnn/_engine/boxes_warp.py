@@ -168,7 +168,7 @@ def _numbers(search: Search, lattice: Lattice, wrapped: Wrapped, turning: Array 
     radius = jnp.reshape(jnp.asarray(largest_radius(search.cutoff)), 1)
 
     def of_system(lattice: Lattice, reach: Array, slack: Array, flags: Array | None) -> Array:
-        return jnp.concatenate([radius, lattice_numbers(lattice, reach, slack, flags)])
+        return jnp.concatenate([radius, lattice_numbers(lattice, reach, slack, wrapped.most_turns, flags)])
 
     return jax.vmap(of_system)(lattice, wrapped.reach, wrapped.slack, turning)
 

@@ -184,11 +184,11 @@ def _numbers_of(given: KeptList, cutoff: np.floating | Array) -> Array:
 
 
 def numbers_of_pairs(cutoff: np.floating | Array, lattice: Lattice) -> Array:
-    """Return the cutoff, the numbers of a lattice and the largest number of a shift, [30], skewed ones with more."""
+    """Return the cutoff, the numbers of a lattice and the largest number of a shift, [31], skewed ones with more."""
     dtype = lattice.matrix.dtype
     radius, most = (jnp.full(1, x, dtype) for x in (cutoff, 2 * LARGEST_TURN + max(lattice.images.reach)))
     none, slack = jnp.ones(lattice.dim, dtype), jnp.zeros((), dtype)
-    return jnp.concatenate([radius, lattice_numbers(lattice, none, slack, lattice.flags), most])
+    return jnp.concatenate([radius, lattice_numbers(lattice, none, slack, slack, lattice.flags), most])
 
 
 def _radii_of(given: KeptList, kind: ListKind) -> tuple[Array | None, Array | None]:

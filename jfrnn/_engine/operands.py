@@ -57,7 +57,7 @@ def as_integer(x: Array) -> Array:
     return lax.bitcast_convert_type(x, jnp.int32) if x.dtype == jnp.float32 else x.astype(jnp.int32)
 
 
-def lattice_numbers(lattice: Lattice, reach: Array, slack: Array, flags: Array | None = None) -> Array:
+def lattice_numbers(lattice: Lattice, reach: Array, slack: Array, turns: Array, flags: Array | None = None) -> Array:
     """Return the numbers of a lattice that kernels read, in the order that `jfrnn.kernels._native` specifies.
 
     Along axes that are not periodic by `flags`, images have numbers below 0.
@@ -67,7 +67,7 @@ def lattice_numbers(lattice: Lattice, reach: Array, slack: Array, flags: Array |
     images = jnp.asarray(lattice.images.reach).astype(lattice.matrix.dtype)
     images = images if flags is None else jnp.where(flags, images, -images)
     parts = [jnp.pad(lattice.matrix, square), jnp.pad(lattice.transform, square), jnp.pad(lattice.origin, line)]
-    parts += [jnp.pad(reach, line, constant_values=1), jnp.pad(images, line), slack]
+    parts += [jnp.pad(reach, line, constant_values=1), jnp.pad(images, line), slack, turns]
     if not lattice.images.orthogonal:
         dim = lattice.dim
         numbers = lattice.given[dim:] if lattice.images.short else lattice.images.numbers.astype(images.dtype)
@@ -116,7 +116,7 @@ def pack_particles(search: Search) -> tuple[Array, Array, Array]:
     turns = query_turns = None
     if torus is not None:
         turns, query_turns = torus[1].turns, torus[1].query_turns
-        numbers.append(lattice_numbers(torus[0], torus[1].reach, torus[1].slack))
+        numbers.append(lattice_numbers(torus[0], torus[1].reach, torus[1].slack, torus[1].most_turns))
     if isinstance(cutoff, Cutoffs) and cutoff.longer is not None:
         numbers.append(cutoff.longer.astype(sources.dtype)[None])
     if batch is not None:

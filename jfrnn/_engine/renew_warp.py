@@ -69,8 +69,8 @@ class BoxNumbers(NamedTuple):
     """What kernels are told of the box of a list, computed once: on a GPU, XLA moves nothing out of a loop.
 
     Attributes:
-        search: What a search is given, [10, 30]: `numbers_of_box`.
-        pairs: What tells which slots hold a pair, [30]: `numbers_of_pairs`.
+        search: What a search is given, [10, 31]: `numbers_of_box`.
+        pairs: What tells which slots hold a pair, [31]: `numbers_of_pairs`.
         sides: Lengths of the edges [length], [d], 0 along open axes.
     """
 
@@ -148,7 +148,7 @@ def numbers_of_box(inputs: Inputs, options: Options) -> Array:
     def row(most: Array) -> Array:
         bounds = bound_wrapping(most, lattice, radius)
         whole = (bounds.enough & is_valid(lattice)).astype(dtype)
-        return jnp.concatenate([radius[None], lattice_numbers(lattice, bounds.reach, bounds.slack), whole[None]])
+        return jnp.concatenate([radius[None], lattice_numbers(lattice, bounds.reach, bounds.slack, most), whole[None]])
 
     return jax.vmap(row)(jnp.asarray(renew.MOST_TURNS, dtype))
 

@@ -64,7 +64,8 @@ def pair_sums(search: Search, keep: Filter, summed: Summed, values: tuple[Array,
                 orders = list(of_particles.values()) if tree or one.long else []
                 orders += orders_for_tree(search).values() if tree else []
                 dims = {"values": max(pair_sum_cuda.sorted_numbers(term, n, kind.dim, double), 1)}
-                make, given = _cuda_callable(one, term, key), [*values, *sort_particles(one, particles, orders), *more]
+                sorted_ones = sort_particles(one, particles, orders)
+                make, given = _cuda_callable(one, term, key), [*beside_rows(term, values), *sorted_ones, *more]
             return results.unpack(*make(*particles, *given, output_dims=results.dims() | dims)[: len(SUMS)])
 
         return call

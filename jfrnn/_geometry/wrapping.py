@@ -45,6 +45,11 @@ class Wrapped(NamedTuple):
     enough: Array
     met: Array
 
+    @property
+    def most_turns(self) -> Array:
+        """At least the largest number of turns along an axis, and less than twice that, as a float: 0 and 1 are exact."""
+        return (self.met & LARGEST_TURN).astype(self.slack.dtype)
+
 
 def pack_turns(points: Array, lattice: Lattice) -> Array:
     """Return `count_turns`, computed once, so that all users see the same value."""

@@ -277,23 +277,10 @@ struct Sort : SortArguments, Places {
                 ++first[cell + 2];
         }
     }
-    // Notes how far away from the cell any of the points lies. Those that are not finite have negative turns, and no pairs.
-    void note_turns(const real* points, int count) {
-        int turned = 0, far = 0;
-        for (int i = 0; PERIODIC && i < count; ++i) {
-            const int packed = Lattice::packed_turns(points[(long long)ROW * i + DIM]);
-            turned |= packed >= 0 && packed != Lattice::NONE;
-            for (int k = 0; k < DIM; ++k)
-                far |= packed >= 0 && (unsigned int)(((packed >> (10 * k)) & 1023) - 511) > 2u;
-        }
-        const int most = far ? 2 : turned;
-        shared.turned = most > shared.turned ? most : shared.turned;
-    }
+    // Notes how far away from the cell any particle lies.
     void note_turns() {
-        shared.turned = 0;
-        note_turns(positions, n);
-        if (!own)
-            note_turns(queries, m);
+        const real most = lattice.most_turns();
+        shared.turned = most < 2 ? (int)most : 2;
     }
     // Coordinates of few sources are put in order at once, those of many by several threads (`gather`).
     int put_in_cells(const Grid& grid, const real* points, int count, int* first, int* order, bool with_axes) {

@@ -19,6 +19,12 @@ struct Overlap {
     }
 };
 
+// a / b, of small numbers without a division of integers, which takes many instructions.
+JFRNN_FUNCTION int quotient(int a, int b) {
+    constexpr int SMALL = 1 << 20;  // a rounded quotient is off by less than 1 / 2b
+    return a < SMALL ? (int)__fdividef((float)a + 0.5f, (float)b) : a / b;
+}
+
 // Numbers the candidates of all lanes, `size` of them from the place `from` on, and shares the runs; returns how many there are.
 JFRNN_FUNCTION int share_runs(const PairSearch& search, int from, int size, int image) {
     Warp& warp = shared_warp();
@@ -52,7 +58,7 @@ struct CellRuns {
 
     JFRNN_MEMBER CellRuns(const PairSearch& search, const Group& group, bool) : reached(find_end(search, group)), rows(1), base(0) {
         if (!PairSearch::INSIDE && search.is_periodic(0))
-            rows = search.period_of(0, __shfl_sync(ALL, reached, 1)) - search.period_of(0, __shfl_sync(ALL, reached, 0)) + 1;
+            rows = period(search, 0, __shfl_sync(ALL, reached, 1)) - period(search, 0, __shfl_sync(ALL, reached, 0)) + 1;
         if (cells_along(0) <= 0 || cells_along(1) <= 0 || cells_along(2) <= 0)
             rows = 0;
         rows *= cells_along(1) * cells_along(2);
@@ -77,6 +83,13 @@ struct CellRuns {
             reached = search.cell_number(x);
         return lane < 2 * DIM ? reached : 0;
     }
+    // The period of a cell; where pairs have one image, it is this one or one beside.
+    JFRNN_FUNCTION int period(const PairSearch& search, int a, whole cell) {
+        if constexpr (PERIODIC == 1)
+            return cell < 0 ? -1 : cell >= (whole)search.inverse_edge[a];
+        else
+            return search.period_of(a, cell);
+    }
     JFRNN_MEMBER whole first_along(int a) const { return __shfl_sync(ALL, reached, 2 * a); }
     JFRNN_MEMBER int cells_along(int a) const { return (int)(__shfl_sync(ALL, reached, 2 * a + 1) - first_along(a)) + 1; }
 
@@ -95,12 +108,14 @@ struct CellRuns {
         for (int a = 0; a < 3; ++a)
             first[a] = first_along(a);
         const int wide = cells_along(1), deep = cells_along(2), length = cells_along(0), row = base + lane;
-        const int across = PairSearch::INSIDE ? 1 : rows / (wide * deep);
+        const int across = PairSearch::INSIDE ? 1 : quotient(rows, wide * deep);
         auto row_at = [&](int row) {
+            const int line = PairSearch::INSIDE ? row : quotient(row, across), level = quotient(line, wide);
+            const whole y = first[1] + (line - level * wide), z = first[2] + level;
             if constexpr (PairSearch::INSIDE)
-                return CellRow{first[0], first[1] + row % wide, first[2] + row / wide, length, search.home};
+                return CellRow{first[0], y, z, length, search.home};
             else
-                return cut_row(search, first, wide, across, length, row);
+                return cut_row(search, first[0], y, z, row - line * across, length);
         };
         const CellRow mine = row_at(PairSearch::INSIDE || row < rows ? row : 0);
         int from = 0, size = 0;
@@ -131,14 +146,14 @@ struct CellRuns {
         return share_runs(search, from, size, mine.image);
     }
     // Finds a row of cells in its own image; it has none where rounding has reached for an image that is beyond every cutoff.
-    JFRNN_FUNCTION CellRow cut_row(const PairSearch& search, const whole* first, int wide, int across, int length, int row) {
-        const int line = row / across, level = line / wide;
-        whole cell[3] = {first[0], first[1] + (line - level * wide), first[2] + level}, last = first[0] + length - 1;
+    JFRNN_FUNCTION CellRow cut_row(const PairSearch& search, whole x, whole y, whole z, int part, int length) {
+        whole cell[3] = {x, y, z}, last = x + length - 1;
         int shift[3] = {0, 0, 0}, image = 0;
+        bool within = true;
         if (search.is_periodic(0)) {
             const whole around = (whole)search.inverse_edge[0];
-            shift[0] = search.period_of(0, first[0]) + row % across;
-            cell[0] = first[0] - shift[0] * around;
+            shift[0] = period(search, 0, x) + part;
+            cell[0] = x - shift[0] * around;
             cell[0] = cell[0] < 0 ? 0 : cell[0];
             last -= shift[0] * around;
             last = last < around ? last : around - 1;
@@ -146,10 +161,11 @@ struct CellRuns {
 #pragma unroll
         for (int a = 1; a < DIM; ++a)
             if (search.is_periodic(a)) {
-                shift[a] = search.period_of(a, cell[a]);
-                cell[a] -= shift[a] * (whole)search.inverse_edge[a];
+                const whole around = (whole)search.inverse_edge[a];
+                shift[a] = period(search, a, cell[a]);
+                cell[a] -= shift[a] * around;
+                within = within && cell[a] >= 0 && cell[a] < around;
             }
-        bool within = true;
 #pragma unroll
         for (int a = 0; a < DIM; ++a) {
             const int most = search.lattice.images(a);

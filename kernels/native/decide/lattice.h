@@ -3,7 +3,7 @@
 #include "bits.h"
 
 constexpr int ROW = DIM + (PERIODIC ? 1 : 0) + BATCHED;         // numbers per particle
-constexpr int LATTICE_END = PERIODIC ? (SKEWED ? 47 : 29) : 1;  // numbers in `cutoff`, but for the last one of a batch
+constexpr int LATTICE_END = PERIODIC ? (SKEWED ? 48 : 30) : 1;  // numbers in `cutoff`, but for the last one of a batch
 
 struct Lattice {
     enum { NONE = 512 | 512 << 10 | (DIM == 3 ? 512 << 20 : 0) };  // packed turns of what lies in the cell
@@ -23,8 +23,8 @@ struct Lattice {
 #endif
     JFRNN_MEMBER real vector(int l, int k) const { return numbers[1 + 3 * l + k]; }
     // the vectors that the caller gave, in which pairs are decided, and how many of each there are in vector l
-    JFRNN_MEMBER real given(int l, int k) const { return numbers[(SKEWED ? 29 : 1) + 3 * l + k]; }
-    JFRNN_MEMBER int number(int l, int k) const { return SKEWED ? (int)numbers[38 + 3 * l + k] : l == k; }
+    JFRNN_MEMBER real given(int l, int k) const { return numbers[(SKEWED ? 30 : 1) + 3 * l + k]; }
+    JFRNN_MEMBER int number(int l, int k) const { return SKEWED ? (int)numbers[39 + 3 * l + k] : l == k; }
     JFRNN_MEMBER real transform(int k, int axis) const { return numbers[10 + 3 * k + axis]; }
     JFRNN_MEMBER real origin(int k) const { return numbers[19 + k]; }
     JFRNN_MEMBER real reach(int axis) const { return numbers[22 + axis]; }
@@ -34,6 +34,8 @@ struct Lattice {
         return BOXES && told < 0 ? -told : told;
     }
     JFRNN_MEMBER real slack() const { return numbers[PERIODIC ? 28 : 0]; }
+    // at least the most lattice vectors between the cell and any particle along an axis, and less than twice as many; 1 is exact
+    JFRNN_MEMBER real most_turns() const { return PERIODIC ? numbers[29] : real(0); }
     JFRNN_MEMBER bool periodic(int axis) const { return numbers[25 + axis] > 0; }
     // uncontracted, so that a coordinate is the same wherever it is computed
 #if defined(__CUDA_ARCH__)

@@ -16,13 +16,16 @@ JFRNN_FUNCTION int load_id_now(unsigned int at) {
     return id;
 }
 // Pairs that a lane takes at once, and what is loaded of them; only what is read takes registers.
+template <bool TURNED>
 struct Taken {
-    bool pairs[TAKEN];
-    int id[TAKEN];
+    static constexpr int MOST = TURNED && TAKEN > 2 ? 2 : TAKEN;
+    bool pairs[MOST];
+    int id[MOST];
     struct Numbers {
         real at[ROW_LENGTH];  // what the term reads of j, coordinates first
         real place[4];        // coordinates of j, and its id, as a `Place` has them
-    } numbers[TAKEN];
+        real given[4];        // coordinates of j as they were given, and its turns
+    } numbers[MOST];
 };
 
 struct Sums : Walk<Sums> {
@@ -30,14 +33,16 @@ struct Sums : Walk<Sums> {
     const real *shared_values, *own_values, *values;
     const Results results;
     const int code_at_home;  // of the image in the box
+    const bool turned;       // must turns be looked at, and coordinates as they were given?
 
     JFRNN_MEMBER explicit Sums(const SumsArguments& a)
         : Walk(a.of_search()),
           shared_values(a.shared_values),
           own_values(a.own_values),
-          values(a.values),
+          values(a.values + places_given(a.n)),
           results(a.sums, a.errors, a.n, a.totals, a.more),
-          code_at_home(NAMED ? (count_codes() - 1) / 2 : 0) {}
+          code_at_home(NAMED ? (count_codes() - 1) / 2 : 0),
+          turned(are_turned(lattice)) {}
 
     JFRNN_MEMBER void open(int block) {
         for (int t = lane; block < query_blocks && t < 2 * TOTALS; t += 32)
@@ -54,61 +59,80 @@ struct Sums : Walk<Sums> {
         if (lane < 2 && pairs.kept <= pairs.tested + 32 * lane)
             warp.ids[pairs.tested + 32 * lane] = 0;
         __syncwarp();
+        Reduction reduction(n);
+        if (READS_ROWS > 0 && turned)
+            reduce_held<false, READS_ROWS != 0>(group, pairs, reduction);
+        else
+            reduce_held<PERIODIC != 0 && INSIDE, false>(group, pairs, reduction);
+        reduction.store(results, {lane, group.my_id, served, lane < group.size, pairs.fresh, finished});
+    }
+    // AT_HOME: no pair has a shift. TURNED: coordinates are those that were given, and shifts are counted between these.
+    template <bool AT_HOME, bool TURNED>
+    JFRNN_MEMBER void reduce_held(const Group& group, const Pairs& pairs, Reduction& reduction) {
         const Term term(shared_values);
         const Place here = lane < group.size ? load_query(group.place + lane) : Place{{0, 0, 0}, 0};
-        const Term::Own own_part = term.own(own_values + (long long)group.my_id * OWN, here.p);
-        Reduction reduction(n);
+        const Term::Own own_part = term.own<AT_HOME>(
+            own_values + (long long)group.my_id * OWN, here.p, TURNED ? queries + (long long)group.my_id * ROW : nullptr);
         HeldPairs held(pairs, lane);
         held.advance();
         held.advance();
-        Taken some, others;
+        Taken<TURNED> some, others;
         take(held, some);
         while (__any_sync(ALL, some.pairs[0])) {
             take(held, others);
-            evaluate(term, own_part, some, reduction);
+            evaluate<AT_HOME>(term, own_part, some, reduction);
             if (!__any_sync(ALL, others.pairs[0]))
                 break;
             take(held, some);
-            evaluate(term, own_part, others, reduction);
+            evaluate<AT_HOME>(term, own_part, others, reduction);
         }
-        reduction.store(results, {lane, group.my_id, served, lane < group.size, pairs.fresh, finished});
     }
     // Takes the next pairs of a block, and loads what is read of them.
-    JFRNN_MEMBER void take(HeldPairs& held, Taken& taken) {
-        unsigned int at[TAKEN];
+    template <bool TURNED>
+    JFRNN_MEMBER void take(HeldPairs& held, Taken<TURNED>& taken) {
+        constexpr int MOST = Taken<TURNED>::MOST;
+        unsigned int at[MOST];
 #pragma unroll
-        for (int k = 0; k < TAKEN; ++k) {
+        for (int k = 0; k < MOST; ++k) {
             taken.pairs[k] = held.hits != 0;
             at[k] = held.take();
         }
 #pragma unroll
-        for (int k = 0; k < TAKEN; ++k)
+        for (int k = 0; k < MOST; ++k)
             taken.id[k] = load_id_now(at[k]);
         if constexpr (NAMED || FROM_PLACES)
 #pragma unroll
-            for (int k = 0; k < TAKEN; ++k)
+            for (int k = 0; k < MOST; ++k)
                 load_numbers<4>(sorted + source_of(taken.id[k]), taken.numbers[k].place);
-        if constexpr (OTHERS + STEPS > 0)
+        if constexpr (COLUMNS > 0)
 #pragma unroll
-            for (int k = 0; k < TAKEN; ++k)
+            for (int k = 0; k < MOST; ++k)
                 load_numbers<ROW_LENGTH>(values + (long long)ROW_LENGTH * source_of(taken.id[k]), taken.numbers[k].at);
+        if constexpr (TURNED)
+#pragma unroll
+            for (int k = 0; k < MOST; ++k)
+                load_numbers<4>(values - places_given(n) + 4ll * source_of(taken.id[k]), taken.numbers[k].given);
         held.advance();
     }
-    JFRNN_MEMBER void evaluate(const Term& term, const Term::Own& own_part, const Taken& taken, Reduction& reduction) {
+    template <bool AT_HOME, bool TURNED>
+    JFRNN_MEMBER void evaluate(const Term& term, const Term::Own& own_part, const Taken<TURNED>& taken, Reduction& reduction) {
 #pragma unroll
-        for (int k = 0; k < TAKEN; ++k) {
-            const Taken::Numbers& numbers = taken.numbers[k];
+        for (int k = 0; k < Taken<TURNED>::MOST; ++k) {
+            const typename Taken<TURNED>::Numbers& numbers = taken.numbers[k];
+            const real* const place = FROM_PLACES ? numbers.place : numbers.at;
             int shift[3] = {0, 0, 0};
             if constexpr (CROSSING && STEPS > 0)
                 shift_of(image_of(taken.id[k]), shift);
             auto column = [&](int c) -> number {  // of j, and behind them steps of the lattice
+                if (c < OTHERS && COLUMN_AXES[c] < 0)
+                    return numbers.at[PLACED + COLUMN_NUMBERS[c]];
                 if (c < OTHERS)
-                    return numbers.at[PLACED + c];
+                    return TURNED ? numbers.given[COLUMN_AXES[c]] : place[COLUMN_AXES[c]];
                 const int axis = STEP_AXES[c - OTHERS];
-                return real(shift[axis] - Lattice::turn(numbers.at[PLACED + OTHERS], axis));
+                return real(TURNED ? shift[axis] - Lattice::turn(numbers.given[3], axis) : shift[axis]);
             };
             number summand[SUMMANDS];
-            term.evaluate(own_part, FROM_PLACES ? numbers.place : numbers.at, column, summand);
+            term.evaluate<AT_HOME>(own_part, place, column, summand);
             reduction.add(summand, taken.pairs[k], [&](int& source, int& code) {
                 source = id_of(numbers.place[3]);
                 code = CROSSING ? image_of(taken.id[k]) : code_at_home;

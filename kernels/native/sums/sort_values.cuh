@@ -1,4 +1,6 @@
-// Puts values of the sources into the order of cells, a row each, on CUDA.
+// Puts values of the sources into the order of cells, a row each, on CUDA. Before these come rows of particles in a box, coordinates as
+// they were given and turns, where these are read: if any particle has turns, or (READS_ROWS is 2) has turns that are not -1, 0 or 1.
+// Otherwise coordinates in the cell stand for them.
 #pragma once
 #include "cells.cuh"
 
@@ -19,14 +21,28 @@ struct SumsArguments {
     }
 };
 
+// How many numbers of `values` come before those that are sorted.
+JFRNN_FUNCTION long long places_given(int n) { return READS_ROWS > 0 ? 4ll * n : 0; }
+JFRNN_FUNCTION bool are_turned(Lattice::Argument lattice) { return READS_ROWS > 0 && lattice.most_turns() >= READS_ROWS; }
+
 struct SortValues : Search {
     const real* others;
     real* values;
-    JFRNN_MEMBER explicit SortValues(const SumsArguments& a) : Search(a.of_search()), others(a.others), values(a.values) {}
+    JFRNN_MEMBER explicit SortValues(const SumsArguments& a)
+        : Search(a.of_search()), others(a.others), values(a.values + places_given(a.n)) {}
 
-    // Writes as much of a row at once as 16 bytes hold.
     JFRNN_MEMBER void run() {
-        constexpr int COLUMNS = OTHERS + (STEPS > 0);  // turns stand behind the others
+        if (are_turned(lattice))
+            for (long long t = thread; t < n; t += threads) {
+                const real* const row = positions + (long long)ROW * id_of(sorted[t].id);
+                const Place given{{row[0], row[1], DIM == 3 ? row[2] : real(0)}, row[PERIODIC ? DIM : 0]};
+                ((Place*)(values - places_given(n)))[t] = given;
+            }
+        if constexpr (COLUMNS > 0)
+            sort_columns();
+    }
+    // Writes as much of a row at once as 16 bytes hold.
+    JFRNN_MEMBER void sort_columns() {
         constexpr int AT_ONCE = 16 / sizeof(real), EACH = ROW_LENGTH < AT_ONCE ? ROW_LENGTH : AT_ONCE, CHUNKS = ROW_LENGTH / EACH;
         struct alignas(EACH * sizeof(real)) Chunk {
             real at[EACH];

@@ -38,12 +38,22 @@ struct ImageSearch : Search {
     static constexpr bool INSIDE = !CROSSING;
     static constexpr int ID_BITS = 27;
     static constexpr int IDS = (PERIODIC == 1 || SUMS) && INSIDE ? 0 : PERIODIC;  // 0: ids tell no image, 1: in the upper bits
-    int codes, home;  // how many codes there are, and the one of no shift
+    static constexpr int TABLED = 32;                                             // codes whose shifts stand in a table
+    int codes, home;        // how many codes there are, and the one of no shift
+    unsigned int per_code;  // (IDS is 2) 2^32 / n, rounded down
 
-    JFRNN_MEMBER explicit ImageSearch(const SearchArguments& given) : Search(given), codes(1), home(0) {
+    JFRNN_MEMBER explicit ImageSearch(const SearchArguments& given) : Search(given), codes(1), home(0), per_code(0) {
         if constexpr (IDS) {
             codes = count_codes();
             home = (codes - 1) / 2;
+        }
+        if constexpr (IDS == 2)
+            per_code = 0xffffffffu / (unsigned int)n;
+        if constexpr (CROSSING) {
+            int shift[3] = {0, 0, 0};
+            count_shift(lane, shift);
+            shared_warp().shifts[lane] = (shift[0] & 255) | (shift[1] & 255) << 8 | (shift[2] & 255) << 16;
+            __syncwarp();
         }
     }
     JFRNN_MEMBER int count_codes() const {
@@ -57,9 +67,23 @@ struct ImageSearch : Search {
         const unsigned int upper = (unsigned int)(code ^ home) << ID_BITS;  // none at home
         return IDS == 0 ? source : IDS == 1 ? (int)((unsigned int)source | upper) : source + n * code;
     }
-    JFRNN_MEMBER int source_of(int id) const { return IDS == 0 ? id : IDS == 1 ? id & ((1 << ID_BITS) - 1) : id % n; }
-    JFRNN_MEMBER int image_of(int id) const { return IDS == 1 ? (int)((unsigned int)id >> ID_BITS) ^ home : id / n; }
+    JFRNN_MEMBER int source_of(int id) const {
+        return IDS == 0 ? id : IDS == 1 ? id & ((1 << ID_BITS) - 1) : id - n * quotient_by_n(id);
+    }
+    JFRNN_MEMBER int image_of(int id) const { return IDS == 1 ? (int)((unsigned int)id >> ID_BITS) ^ home : quotient_by_n(id); }
+    // id / n, where that is the product with what is rounded down, or one more
+    JFRNN_MEMBER int quotient_by_n(int id) const {
+        const unsigned int most = __umulhi((unsigned int)id, per_code);
+        return (int)(most + (id - (int)most * n >= n));
+    }
     JFRNN_MEMBER void shift_of(int code, int* shift) const {
+        if (!CROSSING || (PERIODIC == 2 && codes > TABLED))
+            return count_shift(code, shift);
+        const int packed = shared_warp().shifts[code];
+        for (int k = 0; k < DIM; ++k)
+            shift[k] = packed << (24 - 8 * k) >> 24;
+    }
+    JFRNN_MEMBER void count_shift(int code, int* shift) const {
         for (int k = DIM - 1; k >= 0; --k) {
             const int each = 2 * lattice.images(k) + 1;
             shift[k] = code % each - lattice.images(k);

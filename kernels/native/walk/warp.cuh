@@ -40,6 +40,7 @@ struct alignas(16) Warp {
     Run runs[33];
     int run_images[CROSSING ? 33 : 1];  // the codes of their images, and what leads from home to these
     real run_moved[CROSSING ? 33 : 1][3];
+    int shifts[CROSSING ? 32 : 1];  // of images, where these have so few codes: a byte for each axis
     int leaves[TREE ? LEAVES : 1], leaf_images[TREE && CROSSING ? LEAVES : 1];  // of a tree, those near the queries
 };
 // What every warp reads of the search; here it takes no registers.

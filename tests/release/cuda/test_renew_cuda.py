@@ -57,7 +57,7 @@ class OneThread:
             "info": np.array([[5, 0]], np.int32), "scratch": np.arange(10_000 + 8 * n, dtype=np.int32), "reference": before.copy(),
             "kept_vectors": vectors.copy(), "kept_origin": origin.copy(), "status": np.zeros(1, np.int32),
             "required": np.array([3], np.int32), "rebuild_count": np.zeros(1, np.int32), "order": np.zeros(n, np.int32),
-            "positions": np.zeros((n, dim + 1), dtype), "cutoff": np.full(29, CUTOFF + SKIN, dtype), "stale": np.zeros(1, np.int32),
+            "positions": np.zeros((n, dim + 1), dtype), "cutoff": np.full(30, CUTOFF + SKIN, dtype), "stale": np.zeros(1, np.int32),
             "parts": np.zeros((1, 2), np.int32),
         }  # fmt: skip
 
@@ -130,7 +130,7 @@ def test_a_search_is_given_what_another_one_is(dim, dtype, boxed, spread):
     np.testing.assert_array_equal(arrays["reference"], given.sources)
     if boxed:
         np.testing.assert_array_equal(arrays["positions"].view(f"i{dtype().itemsize}"), rows.view(f"i{dtype().itemsize}"))
-        bounds = [22, 23, 24, 28]  # reach and slack: of at least as many turns
+        bounds = [22, 23, 24, 28, 29]  # reach, slack and turns: of at least as many turns
         np.testing.assert_array_equal(np.delete(arrays["cutoff"], bounds), np.delete(numbers, bounds))
         np.testing.assert_array_less(numbers[bounds], 1e-30 + arrays["cutoff"][bounds] * (1 + 4 * np.finfo(dtype).eps))
         assert arrays["cutoff"][28] <= 3 * numbers[28]
