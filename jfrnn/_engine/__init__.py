@@ -3,6 +3,7 @@
 from jfrnn._engine.auto import ARRAYS, ENGINES, WARP, choose_engine, default_platform, fastest_engine, parse_backend, platform_of
 from jfrnn._engine.kept_warp import KeptList, kept_distances, kept_mask, kept_slopes, kept_sums
 from jfrnn._engine.launch import Call, Shapes, begins_cold, kernel
+from jfrnn._engine.near_warp import find_bits, prepare_for_kernels
 from jfrnn._engine.operands import MOST_IN_BOX, as_float, side_by_side
 from jfrnn._engine.plans import Clear, Launch, Plan, ask_for_huge_pages, share
 from jfrnn._engine.problem import (
@@ -12,9 +13,7 @@ from jfrnn._engine.problem import (
     Inputs,
     Options,
     Search,
-    find_bits,
     hide_inactive,
-    prepare_search,
     rows_asked,
     take_present,
 )
@@ -24,6 +23,6 @@ from jfrnn._engine.rows import add_up, count_rows, find_rows, fold_pairs, length
 from jfrnn._engine.runs import FOLD_GROUP, Block, Slots, Visit
 from jfrnn._engine.start import compiler, level_of_caller
 from jfrnn._engine.structure import Structure, count_few, find_structure_pairs
-from jfrnn._engine.sum_results import FoundSums, Summed
+from jfrnn._engine.sum_results import FoundSums, Summed, Values
 from jfrnn._engine.warp import PLATFORMS, has_order
 from jfrnn._engine.warp_sums import pair_sums

@@ -32,7 +32,7 @@ from jfrnn._engine.operands import (
 )
 from jfrnn._engine.plans import Clear, Launch, Plan, share
 from jfrnn._engine.problem import Filter, Room, Rows, Search, largest_radius
-from jfrnn._engine.sum_results import FoundSums, Summed, SumsOf, beside_rows, numbers_of_values
+from jfrnn._engine.sum_results import FoundSums, Summed, SumsOf, Values, numbers_of_values
 from jfrnn._geometry import Cutoffs, Lattice, Wrapped, most_cells, unpack_turns
 from jfrnn._tracing import on_platform
 from jfrnn.kernels import Kind, boxes, cells_cpu, pair_sum_cpu, tree_cpu
@@ -191,27 +191,27 @@ def _plan_on_cuda(kind: Kind, shapes: Shapes, _: int) -> Plan:
 # --- sums ----------------------------------------------------------------------------------------------------------------
 
 
-def box_sums(search: Search, keep: Filter, summed: Summed, values: tuple[Array, Array, Array]) -> FoundSums:
+def box_sums(search: Search, keep: Filter, summed: Summed, values: Values) -> FoundSums:
     """Sum a term over the pairs of a search in which each system has a box of its own, as `jfrnn._engine.warp_sums.pair_sums`."""
-    (n, m), (shared, own, others) = search.sizes, values
+    n, m = search.sizes
     term, key, kind = summed.term, summed.key, summed.of(kind_of_search(search, keep))
 
-    def on_cpu(search: Search, *values: Array) -> FoundSums:
+    def on_cpu(search: Search, values: Values) -> FoundSums:
         results, scratch = SumsOf(term, kind, m, pair_sum_cpu.slots(m)), _scratch_dims(search)
         columns = max(pair_sum_cpu.sorted_numbers(term, n, kind.dim, kind.double), 1)
         dims = results.dims() | {"columns": columns, "info": 2} | scratch
-        given = [*_particles(search), *beside_rows(term, values), *excluded_rows(search), *_cutoffs_of_particles(search)]
+        given = [*_particles(search), *values.beside_rows, *excluded_rows(search), *_cutoffs_of_particles(search)]
         return results.unpack(*_cpu_sum_callable(kind, term, key)(*given, output_dims=dims)[: len(SUMS)])
 
-    def on_cuda(search: Search, shared: Array, own: Array, others: Array) -> FoundSums:
+    def on_cuda(search: Search, values: Values) -> FoundSums:
         results, given = SumsOf(term, kind, m, boxes.slots(m)), _operands(search)
         ids = given[_GIVEN.index("ids")]
-        given += [shared, own, _sorted_columns(search, term, others, ids)]
+        given += [values.shared, values.own, _sorted_columns(search, term, values.others, ids)]
         given += [*excluded_rows(search), *_cutoffs_of_pairs(search, ids)]
         call_sums = _cuda_sum_callable(kind, term, key)
         return results.unpack(*call_sums(*given, output_dims=results.dims() | {"info": 2})[: len(SUMS)])
 
-    return on_platform(search._replace(checks={}), shared, own, others, cpu=on_cpu, cuda=on_cuda)
+    return on_platform(search._replace(checks={}), values, cpu=on_cpu, cuda=on_cuda)
 
 
 def _sorted_columns(search: Search, term: TermText, others: Array, ids: Array) -> Array:

@@ -114,16 +114,19 @@ def pack_particles(search: Search) -> tuple[Array, Array, Array]:
     sources, queries, cutoff, batch, torus = search[:5]
     numbers = [jnp.reshape(jnp.asarray(largest_radius(cutoff)), 1)]
     turns = query_turns = None
+    rows = None
     if torus is not None:
+        rows = None if batch is not None else torus[1].rows
         turns, query_turns = torus[1].turns, torus[1].query_turns
         numbers.append(lattice_numbers(torus[0], torus[1].reach, torus[1].slack, torus[1].most_turns))
     if isinstance(cutoff, Cutoffs) and cutoff.longer is not None:
         numbers.append(cutoff.longer.astype(sources.dtype)[None])
     if batch is not None:
         numbers.append(as_float(jnp.max(batch.of_all)[None], sources.dtype))
-    sources = particle_rows(sources, turns, None if batch is None else batch.sources)
-    rows = sources if queries is None else particle_rows(queries, query_turns, None if batch is None else batch.queries)
-    return sources, rows, jnp.concatenate(numbers)
+    if rows is None:
+        first = particle_rows(sources, turns, None if batch is None else batch.sources)
+        rows = first, first if queries is None else particle_rows(queries, query_turns, None if batch is None else batch.queries)
+    return rows[0], rows[1], jnp.concatenate(numbers)
 
 
 # --- calls --------------------------------------------------------------------------------------------------------------

@@ -1,6 +1,8 @@
 """The operands and options of a search, and the protocol that every engine implements."""
 
+import dataclasses
 import functools
+from collections.abc import Callable
 from typing import NamedTuple, Protocol
 
 import jax
@@ -9,7 +11,6 @@ import numpy as np
 from jax import Array, lax
 
 from jfrnn import _geometry as geometry
-from jfrnn._tracing import compile_program
 
 
 class Filter(NamedTuple):
@@ -211,8 +212,14 @@ def rows_asked(inputs: Inputs) -> tuple[Array, Array | None]:
     return inputs.sources, take_present(inputs).active
 
 
-def prepare_search(inputs: Inputs, options: Options) -> Search:
-    """Prepare the operands for engines. No gradient flows through."""
+Bring = Callable[[Array, geometry.Lattice], geometry.NearRows]  # points near a box that stands along the axes
+
+
+def prepare_search(inputs: Inputs, options: Options, bring: Bring | None = None) -> Search:
+    """Prepare the operands for engines. No gradient flows through.
+
+    `bring` brings particles near a box that stands along the axes, if there is one for all; array programs do else.
+    """
     asked = lax.stop_gradient(inputs)
     given, queries, active, box, cutoff, batch, exclude = take_present(asked)
     sources, images = hide_inactive(given, active), options.images
@@ -230,9 +237,19 @@ def prepare_search(inputs: Inputs, options: Options) -> Search:
         excluded = None if exclude is None else geometry.exclude_in_space(exclude.rows)
         return Search(sources, queries, cutoff, batch, None, checks, excluded)
     lattice = geometry.make_lattice(box, images, np.dtype(sources.dtype))
-    near = [geometry.bring_near(x, lattice) for x in (sources, queries) if x is not None]
-    sources, queries = near[0].points, None if queries is None else near[1].points
-    wrapped, moved = geometry.wrap(sources, queries, lattice, largest_radius(cutoff)), (near[0].turns, near[-1].turns)
+    clouds, moved = [x for x in (sources, queries) if x is not None], None
+    named = exclude is not None and exclude.rows.shifts is not None  # images, between points that were not moved
+    brought = None
+    if bring is not None and not named and geometry.stands_along_axes(lattice):
+        # with the origin as it was given: XLA sees then that a search and its checks ask for the same
+        box_as_given = dataclasses.replace(lattice, origin=jnp.asarray(box.origin).astype(sources.dtype))
+        brought = [bring(x, box_as_given) for x in clouds]
+        points = [x.points for x in brought]
+    else:
+        near = [geometry.bring_near(x, lattice) for x in clouds]
+        points, moved = [x.points for x in near], (near[0].turns, near[-1].turns)
+    sources, queries = points[0], None if queries is None else points[1]
+    wrapped = geometry.wrap(sources, queries, lattice, largest_radius(cutoff), brought=brought)
     excluded = None if exclude is None else geometry.exclude_in_lattice(exclude.rows, lattice, wrapped, moved, None)
     checks[geometry.Status.BOX_TOO_SMALL] = wrapped.enough & geometry.is_valid(lattice)
     checks[geometry.Status.OUT_OF_RANGE] = (wrapped.met & geometry.TOO_FAR) == 0
@@ -293,12 +310,6 @@ def _radius_of_systems(search: Search, batch: geometry.Batch, boxes: int) -> np.
             found.append(jnp.zeros(boxes, known.dtype).at[systems].max(known))
     largest = functools.reduce(jnp.minimum if rule in ("both", "table") else jnp.maximum, found)
     return jnp.where(largest > 0, largest, search.cutoff.largest)[:, None, None]
-
-
-@functools.partial(compile_program, static_argnames="options")
-def find_bits(inputs: Inputs, options: Options) -> Array:
-    """Find the bits of `Status` that particles, cutoffs and box set, except that for positions that are not finite; [] int32."""
-    return bits_of(prepare_search(inputs, options).checks)
 
 
 def bits_of(checks: dict[geometry.Status, Array]) -> Array:

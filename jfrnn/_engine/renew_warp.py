@@ -15,17 +15,12 @@ from jax import Array
 from jfrnn._engine.auto import platform_of
 from jfrnn._engine.kept_warp import numbers_of_pairs
 from jfrnn._engine.launch import Call, Shapes, kernel
+from jfrnn._engine.near_warp import constants_of_far
 from jfrnn._engine.operands import MOST_IN_BOX, describe_call, lattice_numbers
 from jfrnn._engine.plans import Clear, Launch, Plan, share
 from jfrnn._engine.problem import Inputs, Options
 from jfrnn._engine.warp import PLATFORMS, all_meet, plan_few, plan_on_cuda
 from jfrnn._geometry import (
-    FAR,
-    FAR_BITS,
-    FAR_STEP,
-    LARGEST_TURN,
-    NOT_FINITE,
-    TOO_FAR,
     Box,
     Cutoff,
     Status,
@@ -39,7 +34,6 @@ from jfrnn._tracing import compile_program
 from jfrnn.kernels import Kind, cells_cuda, few_cuda, renew
 
 _BITS = {"NOT_FINITE": Status.NONFINITE, "OUT_OF_RANGE": Status.OUT_OF_RANGE, "BOX_TOO_SMALL": Status.BOX_TOO_SMALL}
-_FAR = {"FAR": FAR, "FAR_STEP": FAR_STEP, "LARGEST_TURN": LARGEST_TURN, "MET_NOT_FINITE": NOT_FINITE, "MET_TOO_FAR": TOO_FAR}
 _KEPT = ("idx", "counts", "status", "required", "rebuild_count", "reference")
 _KEPT_OF_BOX = ("kept_vectors", "kept_origin")
 
@@ -135,7 +129,7 @@ def _moved_callable(dim: int, double: bool, boxed: bool) -> Call:
 def constants_of(double: bool) -> tuple[tuple[str, int], ...]:
     """Return what kernels are told of bits of a status, and of far points, as array programs have it."""
     bits = {f"BIT_{name}": bit.value for name, bit in _BITS.items()}
-    return tuple((bits | _FAR | {"FAR_MOST": 1 << FAR_BITS[8 if double else 4]}).items())
+    return tuple((bits | constants_of_far(double)).items())
 
 
 def numbers_of_box(inputs: Inputs, options: Options) -> Array:

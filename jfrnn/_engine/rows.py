@@ -12,6 +12,7 @@ from jax import Array, lax
 from jfrnn._engine.arrays import complete_rows, fold_candidates, is_few, refuse_many
 from jfrnn._engine.auto import platform_of
 from jfrnn._engine.candidates import Candidates
+from jfrnn._engine.near_warp import prepare_for_kernels
 from jfrnn._engine.problem import Engine, Inputs, Options, Room, Rows, Search, bits_of, prepare_search, rows_asked, take_present
 from jfrnn._engine.reverse_warp import pack_rows
 from jfrnn._engine.runs import State, Visit, fold_neighbors
@@ -107,7 +108,7 @@ def mark_counts(inputs: Inputs, counts: Array, status: Array) -> Array:
 def find_rows(inputs: Inputs, options: Options, capacity: int | Room | None) -> Found:
     """List the neighbors of every query, or only count them (capacity=None). Integers: no gradient flows through."""
     given, given_queries, active = lax.stop_gradient(take_present(inputs)[:3])
-    search = prepare_search(inputs, options)
+    search = prepare_for_kernels(inputs, options)
     sources, queries, cutoff, _, torus, checks = search[:6]
     rows = _empty_rows(search, options, capacity) if 0 in search.sizes else options.engine.rows(search, options, capacity)
     if torus is not None and active is None and isinstance(cutoff, Cutoff):  # else positions may be infinite for other reasons

@@ -34,6 +34,32 @@ class Summed(NamedTuple):
         return kind._replace(later=False, compensated=self.compensated, extremes=self.extremes)
 
 
+class Values(NamedTuple):
+    """What a term reads.
+
+    Attributes:
+        shared: Of all pairs, [width].
+        own, others: Of i, [m, width], and of j, [n, width].
+        own_beside, others_beside: The same without what rows of particles hold, too.
+    """
+
+    shared: Array
+    own: Array
+    others: Array
+    own_beside: Array
+    others_beside: Array
+
+    @property
+    def whole(self) -> tuple[Array, Array, Array]:
+        """What kernels read that know no rows of particles."""
+        return self.shared, self.own, self.others
+
+    @property
+    def beside_rows(self) -> tuple[Array, Array, Array]:
+        """What kernels read beside rows of particles."""
+        return self.shared, self.own_beside, self.others_beside
+
+
 class SumsOf(NamedTuple):
     """The results of a kernel that sums a term: for each of `rows` queries, and over all pairs in `slots` partial sums."""
 
@@ -69,19 +95,6 @@ class SumsOf(NamedTuple):
         return len(self.term.sums) - self._totals
 
 
-def beside_rows(term: TermText, values: tuple[Array, ...]) -> tuple[Array, Array, Array]:
-    """Return values without columns of i and of j that rows of particles hold, too: kernels of the CPU read them there."""
-
-    def take(columns: list[int], given: Array) -> Array:
-        if columns == list(range(given.shape[1])):
-            return given
-        found = [given[:, k : k + 1] for k in columns]
-        return jnp.concatenate(found, axis=1) if found else jnp.zeros((1, 1), given.dtype)
-
-    shared, own, others = values
-    return shared, take(term.own_columns, own), take(term.other_columns, others)
-
-
 def numbers_of_values(term: TermText, shapes: Mapping[str, tuple[int, ...]]) -> dict[str, int]:
-    """Return the numbers of the kernel of the CPU that sorts such values and, where they are read, what rows of particles hold."""
+    """Return the numbers of the kernel of the CPU that sorts values and, where they are read, what rows of particles hold."""
     return {"width": len(term.other_columns), "reads_rows": term.reads_rows, "row_numbers": shapes["positions"][1]}

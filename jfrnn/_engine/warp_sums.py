@@ -24,7 +24,7 @@ from jfrnn._engine.operands import (
 )
 from jfrnn._engine.plans import Launch, Plan, share
 from jfrnn._engine.problem import Filter, Search
-from jfrnn._engine.sum_results import FoundSums, Summed, SumsOf, TermText, beside_rows, numbers_of_values
+from jfrnn._engine.sum_results import FoundSums, Summed, SumsOf, TermText, Values, numbers_of_values
 from jfrnn._engine.warp import QUERIES_PER_THREAD, are_few, by_cells_or_tree, fit_tree, place_launches
 from jfrnn._geometry import Cutoffs
 from jfrnn._tracing import on_platform
@@ -34,7 +34,7 @@ _GIVEN = ("positions", "queries", "cutoff", "shared_values", "own_values", "othe
 _WORDS = {"info": np.int32, "scratch": np.int32}  # what is written where particles are sorted
 
 
-def pair_sums(search: Search, keep: Filter, summed: Summed, values: tuple[Array, Array, Array]) -> FoundSums:
+def pair_sums(search: Search, keep: Filter, summed: Summed, values: Values) -> FoundSums:
     """Sum a term over the pairs of a search, with the columns that it reads.
 
     Returns:
@@ -46,8 +46,8 @@ def pair_sums(search: Search, keep: Filter, summed: Summed, values: tuple[Array,
     if search.per_system:
         return box_sums(search, keep, summed._replace(term=term), values)
 
-    def on(cuda: bool, tree: bool = False) -> Callable[[Search, tuple[Array, Array, Array]], FoundSums]:
-        def call(search: Search, values: tuple[Array, Array, Array]) -> FoundSums:
+    def on(cuda: bool, tree: bool = False) -> Callable[[Search, Values], FoundSums]:
+        def call(search: Search, values: Values) -> FoundSums:
             of_particles = cutoffs_of_particles(search.cutoff) if isinstance(search.cutoff, Cutoffs) else {}
             particles, more = pack_particles(search), [*excluded_rows(search), *of_particles.values()]
             n, m, width, double = len(particles[0]), len(particles[1]), 2 if kind.double else 1, kind.double
@@ -55,17 +55,17 @@ def pair_sums(search: Search, keep: Filter, summed: Summed, values: tuple[Array,
                 results = SumsOf(term, kind, m, pair_sum_cpu.slots(m))
                 words = (tree_cpu if kind.rule else cells_cpu).scratch_words(n, m, kind.dim, width, kind.own)
                 dims = {"columns": max(pair_sum_cpu.sorted_numbers(term, n, kind.dim, double), 1), "info": 2, "scratch": words}
-                make, given = _cpu_callable(kind, term, key), [*beside_rows(term, values), *more]
+                make, given = _cpu_callable(kind, term, key), [*values.beside_rows, *more]
             elif not kind.rule and are_few(search):
                 results, dims = SumsOf(term, kind, m, few_cuda.slots(m)), {}
-                make, given = _few_callable(kind, term, key), [*values, *more]
+                make, given = _few_callable(kind, term, key), [*values.whole, *more]
             else:
                 results, one = SumsOf(term, kind, m, pair_sum_cuda.slots(m)), kind._replace(tree=tree)
                 orders = list(of_particles.values()) if tree or one.long else []
                 orders += orders_for_tree(search).values() if tree else []
                 dims = {"values": max(pair_sum_cuda.sorted_numbers(term, n, kind.dim, double), 1)}
                 sorted_ones = sort_particles(one, particles, orders)
-                make, given = _cuda_callable(one, term, key), [*beside_rows(term, values), *sorted_ones, *more]
+                make, given = _cuda_callable(one, term, key), [*values.beside_rows, *sorted_ones, *more]
             return results.unpack(*make(*particles, *given, output_dims=results.dims() | dims)[: len(SUMS)])
 
         return call

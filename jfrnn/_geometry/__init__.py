@@ -72,6 +72,7 @@ from jfrnn._geometry.lattice import (
     nearest_shifts,
     shift_pairs,
     sides_of,
+    stands_along_axes,
     translation,
 )
 from jfrnn._geometry.meshes import merge_vertices
@@ -93,4 +94,4 @@ from jfrnn._geometry.status import (
     shape_of,
     tell,
 )
-from jfrnn._geometry.wrapping import NOT_FINITE, TOO_FAR, Wrapped, bound_wrapping, unpack_turns, wrap
+from jfrnn._geometry.wrapping import NOT_FINITE, TOO_FAR, NearRows, Wrapped, bound_wrapping, unpack_turns, wrap

@@ -186,15 +186,16 @@ def exclude_in_space(rows: ExcludedRows) -> ExcludedCodes:
 
 
 def exclude_in_lattice(
-    rows: ExcludedRows, lattice: Lattice, wrapped: Wrapped, moved: tuple[Array, Array], systems: Array | None
+    rows: ExcludedRows, lattice: Lattice, wrapped: Wrapped, moved: tuple[Array, Array] | None, systems: Array | None
 ) -> ExcludedCodes:
     """Return rows in a lattice, or where each system [m] of the queries has one.
 
-    `moved` are the lattice vectors by which sources [n, d] and queries [m, d] were brought near, whole floats. A shift S between
+    `moved` are the lattice vectors by which sources [n, d] and queries [m, d] were brought near, whole floats; None: rows have no
+    shifts. A shift S between
     points as they are given is S - (those of i) + (those of j) between near points, and this, in short vectors if these are
     searched, less the turns of i and more those of j, between wrapped ones. Refused are more names of images than int32 has.
     """
-    if rows.shifts is None:
+    if rows.shifts is None or moved is None:
         return ExcludedCodes(rows.starts, rows.others, None)
     images, dim, n = lattice.images, lattice.dim, len(wrapped.sources)
     if n * images.total >= 2**31:

@@ -268,12 +268,17 @@ class Near(NamedTuple):
     turns: Array
 
 
+def stands_along_axes(lattice: Lattice) -> bool:
+    """Say whether the vectors that are searched are those that were given, and lie along the axes."""
+    return lattice.images.orthogonal and not lattice.images.counts_short
+
+
 def bring_near(points: Array, lattice: Lattice) -> Near:
     """Move far points [n, d] near the box of a lattice, or each near that of its row (`jfrnn._geometry.far`).
 
     Differentiable in points and vectors. In lattices that are searched in short vectors, no points are moved.
     """
-    if lattice.images.orthogonal and not lattice.images.counts_short:
+    if stands_along_axes(lattice):
         return _bring_each_near(points, lattice)
     return _look_whether_far(points, lattice)
 

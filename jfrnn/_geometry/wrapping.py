@@ -33,6 +33,7 @@ class Wrapped(NamedTuple):
         margin: [d] the part of `reach` that does not depend on the cutoff.
         enough: [] bool, whether no pair needs other images than those considered.
         met: [] int32, the bits `NOT_FINITE` and `TOO_FAR` if there are such particles; the lower bits bound the turns.
+        rows: Rows of sources and of queries, if a kernel has brought them near.
     """
 
     sources: Array
@@ -44,11 +45,28 @@ class Wrapped(NamedTuple):
     margin: Array
     enough: Array
     met: Array
+    rows: tuple[Array, Array] | None = None
 
     @property
     def most_turns(self) -> Array:
         """At least the largest number of turns along an axis, and less than twice that, as a float: 0 and 1 are exact."""
         return (self.met & LARGEST_TURN).astype(self.slack.dtype)
+
+
+class NearRows(NamedTuple):
+    """Particles that a kernel has brought near a box.
+
+    Attributes:
+        rows: [n, d + 1] their coordinates, and their packed turns, encoded as a float.
+        points: [n, d] the coordinates.
+        turns: [n] int32, the turns.
+        met: [] int32, as in `Wrapped`.
+    """
+
+    rows: Array
+    points: Array
+    turns: Array
+    met: Array
 
 
 def pack_turns(points: Array, lattice: Lattice) -> Array:
@@ -87,9 +105,14 @@ def unpack_turns(packed: Array, dim: int) -> Array:
 
 
 def wrap(
-    sources: Array, queries: Array | None, lattice: Lattice, radius: np.floating | Array, batch: Batch | None = None
+    sources: Array,
+    queries: Array | None,
+    lattice: Lattice,
+    radius: np.floating | Array,
+    batch: Batch | None = None,
+    brought: list[NearRows] | None = None,
 ) -> Wrapped:
-    """Translate particles into one cell of the lattice and bound the rounding errors.
+    """Translate particles into one cell of the lattice and bound the rounding errors; `brought`: what kernels know of them.
 
     Let u be the computed fractional coordinates, R = matrix @ transform - 1 the residual of the transform (periodic columns). Then
     |u_j + S - u_i - (x_j - x_i + S·A) @ transform| is at most the rounding errors of u_i and u_j plus sum |S|·|R|, and |d @
@@ -99,19 +122,25 @@ def wrap(
     periodic = lattice.spread(lattice.periodic, lattice.origin.ndim)
     clouds = [sources] if queries is None else [sources, queries]
     lattices = [lattice] * len(clouds) if batch is None else [lattice.of_rows(x) for x in (batch.sources, batch.of_queries)]
-    packed, wrapped = [pack_turns(points, each) for points, each in zip(clouds, lattices, strict=False)], []
+    if brought is None:
+        packed = [pack_turns(points, each) for points, each in zip(clouds, lattices, strict=False)]
+        found = [_met(turns, dim) for turns in packed]
+    else:
+        packed, found = [x.turns for x in brought], [x.met for x in brought]
+    wrapped = []
     for points, turns, each in zip(clouds, packed, lattices, strict=False):
         off = unpack_turns(turns, dim).astype(dtype)
         moved = jnp.where((off == 0).all(axis=1, keepdims=True), points, points - translation(off, each))
         wrapped.append(jnp.where(turns[:, None] >= 0, moved, jnp.nan))
-    met = functools.reduce(jnp.bitwise_or, (_met(turns, dim) for turns in packed))
+    met = functools.reduce(jnp.bitwise_or, found)
     most = (met & LARGEST_TURN).astype(dtype)  # at least the largest number of turns, and less than twice that
 
     largest = None
     if not (images.orthogonal or (lattice.flags is None and np.all(periodic))):
         largest = functools.reduce(jnp.maximum, _largest_finite(wrapped, batch, len(lattice.matrix)))
     bounds = bound_wrapping(most, lattice, radius, batch is not None, largest)
-    return Wrapped(wrapped[0], wrapped[-1], packed[0], packed[-1], *bounds, met)
+    rows = None if brought is None else (brought[0].rows, brought[-1].rows)
+    return Wrapped(wrapped[0], wrapped[-1], packed[0], packed[-1], *bounds, met, rows)
 
 
 class Bounds(NamedTuple):

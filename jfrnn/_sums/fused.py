@@ -178,7 +178,7 @@ def _ends(term: Term) -> Ends | None:
 def sums(inputs: engine.Inputs, options: engine.Options, term: Term, operands: Groups, compensated: bool) -> list[Array]:
     """Sum a term over all pairs of a search, as `jfrnn._sums.relations.sum_pairs` specifies."""
     plan = make_plan(term, *_kind(inputs))
-    found, totals, _ = _launch(engine.prepare_search(inputs, options), options, plan, operands, compensated)
+    found, totals, _ = _launch(engine.prepare_for_kernels(inputs, options), options, plan, operands, compensated)
     return _unpack(term, found, totals)
 
 
@@ -225,7 +225,7 @@ def extremes(
     and in a box their lattice shifts [rows, elements, d]. Of equal values, that of the smallest source is chosen, of its images
     any.
     """
-    search = engine.prepare_search(inputs, options)
+    search = engine.prepare_for_kernels(inputs, options)
     (values,), _, which = _launch(search, options, make_plan(term, *_kind(inputs), not largest), operands, False, extremes=True)
     source, shifts = which[..., 0], None
     if search.torus is not None:
@@ -251,10 +251,10 @@ def _launch(
     if torus is not None:
         operands = join(operands, Groups((), (torus[1].query_turns,), (torus[1].turns,)))
     n, m = search.sizes
-    sizes = None, m, n
-    columns = plan.shared, plan.own, plan.others
-    shared, own, others = (_pack(*group, sources.dtype) for group in zip(operands, columns, sizes, strict=True))
-    values = shared, own, others
+    own, others = (tuple(x[k] for k in y) for x, y in ((plan.own, plan.text.own_columns), (plan.others, plan.text.other_columns)))
+    columns = (operands.shared, plan.shared, None), (operands.own, plan.own, m), (operands.others, plan.others, n)
+    columns += (operands.own, own, m), (operands.others, others, n)
+    values = engine.Values(*(_pack(*group, sources.dtype) for group in columns))
     return engine.pair_sums(search, options.filter, engine.Summed(plan.text, plan.key, compensated, extremes), values)
 
 

@@ -28,7 +28,7 @@ def density(x, m, backend="warp", **options):
 def compiled(function, *args):
     """Return a program, and how many sums it calls."""
     program = jax.jit(function).lower(*args).compile()
-    return program, program.as_text().count('custom_call_target="jfrnn"')
+    return program, program.as_text().count('kernel = "jfrnn_pair_sum')
 
 
 def count_calls(function, *args):

@@ -75,6 +75,18 @@ def test_where_no_pair_crosses_the_box(fn):
         assert_marks(sums(at), pairs, at, matrix=lengths)
 
 
+def test_displacements_of_particles_boxes_apart_are_those_of_their_coordinates():
+    """Wrapped coordinates of such particles are rounded: those that were given are read, and the turns between them."""
+    rng, cutoff, length = np.random.default_rng(5), 0.2, np.float32(0.7)
+    x = (rng.random((5000, 3)) * length + rng.integers(170, 173, (5000, 3)) * length).astype(np.float32)
+    found = fused(lambda r, i, j: r @ r, jnp.asarray(x), cutoff, box=jfrnn.Box([length] * 3))
+    r = x.astype(np.float64)[None, :200] - x.astype(np.float64)[:, None]
+    r -= np.round(r / length) * np.float64(length)
+    squares = (r * r).sum(axis=2)
+    near = (squares < np.float64(np.float32(cutoff)) ** 2) & (np.arange(5000)[:, None] != np.arange(200))
+    np.testing.assert_allclose(np.asarray(found)[:200], np.where(near, squares, 0).sum(axis=0), rtol=2e-6)
+
+
 @pytest.mark.parametrize("name", ["periodic", slow("periodic_images")])
 def test_batches(name):
     """In a box that is traced: its image is the nearest one, or how many are looked at is said."""

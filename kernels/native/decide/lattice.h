@@ -6,6 +6,7 @@ constexpr int ROW = DIM + (PERIODIC ? 1 : 0) + BATCHED;         // numbers per p
 constexpr int LATTICE_END = PERIODIC ? (SKEWED ? 48 : 30) : 1;  // numbers in `cutoff`, but for the last one of a batch
 
 struct Lattice {
+    enum { GIVEN = SKEWED ? 30 : 1, NUMBERS = GIVEN + 9 };  // where vectors that were given stand, and how many of them make one
     enum { NONE = 512 | 512 << 10 | (DIM == 3 ? 512 << 20 : 0) };  // packed turns of what lies in the cell
 #if defined(__CUDACC__)
     const real* numbers;
@@ -23,8 +24,8 @@ struct Lattice {
 #endif
     JFRNN_MEMBER real vector(int l, int k) const { return numbers[1 + 3 * l + k]; }
     // the vectors that the caller gave, in which pairs are decided, and how many of each there are in vector l
-    JFRNN_MEMBER real given(int l, int k) const { return numbers[(SKEWED ? 30 : 1) + 3 * l + k]; }
-    JFRNN_MEMBER int number(int l, int k) const { return SKEWED ? (int)numbers[39 + 3 * l + k] : l == k; }
+    JFRNN_MEMBER real given(int l, int k) const { return numbers[GIVEN + 3 * l + k]; }
+    JFRNN_MEMBER int number(int l, int k) const { return SKEWED ? (int)numbers[NUMBERS + 3 * l + k] : l == k; }
     JFRNN_MEMBER real transform(int k, int axis) const { return numbers[10 + 3 * k + axis]; }
     JFRNN_MEMBER real origin(int k) const { return numbers[19 + k]; }
     JFRNN_MEMBER real reach(int axis) const { return numbers[22 + axis]; }

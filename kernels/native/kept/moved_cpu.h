@@ -17,13 +17,13 @@ struct Moved : MovedArguments {
     real near;  // a point has not moved too far if no coordinate has moved by more: images that are nearest then are the same
 
     explicit Moved(const MovedArguments& given)
-        : MovedArguments(given), floats{}, motion{now, reference, limit, Lattice(cutoff)}, near(nearness()) {}
+        : MovedArguments(given), floats{}, motion{now, reference, limit, Near(cutoff)}, near(nearness()) {}
     real nearness() const {
         const real each = limit[0] / (DIM * (1 + 16 * EPS));
         real found = DOUBLE ? sqrt(each) : sqrtf(each);
         for (int k = 0; PERIODIC && k < DIM; ++k)
-            if (motion.lattice.periodic(k) && !(found < motion.lattice.vector(k, k) / 4))
-                found = motion.lattice.vector(k, k) / 4;
+            if (motion.near.lattice.periodic(k) && !(found < motion.near.lattice.vector(k, k) / 4))
+                found = motion.near.lattice.vector(k, k) / 4;
         return found;
     }
     void run() const {

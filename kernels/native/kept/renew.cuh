@@ -22,7 +22,7 @@ struct Renew : RenewArguments {
     const Motion motion;
 
     JFRNN_MEMBER explicit Renew(const RenewArguments& given)
-        : RenewArguments(given), motion{given.now, given.reference, given.limit, Lattice(given.cutoffs)} {}
+        : RenewArguments(given), motion{given.now, given.reference, given.limit, Near(given.cutoffs)} {}
 
     // Says for each block whether one of its points has moved too far, or may have by rounding.
     JFRNN_MEMBER void check() const {
@@ -48,7 +48,7 @@ struct Renew : RenewArguments {
             for (int k = 0; k < DIM; ++k)
                 reference[DIM * i + k] = point[k];
             if constexpr (PERIODIC)
-                own_met |= write_row(i, point);
+                own_met |= motion.near.write_row(point, positions + ROW * i);
             if (ORDERED && i + 1 < n) {
                 motion.take(i + 1, next);
                 bool close = true;
@@ -124,31 +124,4 @@ struct Renew : RenewArguments {
 private:
     // The row of `cutoffs` that holds for all turns that were met: of 0, and of powers of two less one.
     JFRNN_FUNCTION int row_of(int met) { return 32 - __clz(met & (MET_NOT_FINITE - 1)); }
-    // Writes a point and its packed turns (jfrnn/_geometry/wrapping.py), and returns what was met.
-    JFRNN_MEMBER int write_row(long long i, const real* p) const {
-        int packed = 0, met = 0;
-        bool near = true;
-        for (int k = 0; k < DIM; ++k) {
-            const real turns = motion.lattice.periodic(k) ? motion.turns_of(p, k) : real(0);
-            near &= fabs(turns) <= LARGEST_TURN;
-            const int whole_turns = near ? (int)turns : 0;
-            packed |= (whole_turns + 512) << (10 * k);
-            met |= whole_turns < 0 ? -whole_turns : whole_turns;
-        }
-        if (!finite_point(p)) {
-            packed = -1;
-            met = MET_NOT_FINITE;
-        } else if (!near) {
-            packed = -2;
-            met = MET_TOO_FAR;
-        }
-        real* row = positions + ROW * i;
-        for (int k = 0; k < DIM; ++k)
-            row[k] = p[k];
-        if constexpr (DOUBLE)
-            row[DIM] = packed;
-        else
-            row[DIM] = __int_as_float(packed);
-        return met;
-    }
 };

@@ -41,7 +41,7 @@ struct Structure : StructureArguments {
             turns[k] = room_for_ints + k * (long long)n;
             for (int l = 0; l < 3; ++l) {
                 given[k][l] = periodic[k] ? cell[3 * k + l] : 0;
-                lattice.numbers[(SKEWED ? 29 : 1) + 3 * k + l] = real(given[k][l]);
+                lattice.numbers[Lattice::GIVEN + 3 * k + l] = real(given[k][l]);
                 number[k][l] = k == l;
             }
         }

@@ -12,10 +12,8 @@ struct Pairs {
     bool fresh;                 // no pairs of this group have been settled
 };
 
-// Keeps a candidate, the one of a number, if it is near; `x` is where it is from the center. `source` is its own, where candidates are
-// NAMED_APART.
-JFRNN_FUNCTION void keep(
-    const PairSearch& search, bool is_near, const Place& candidate, int source, const real* x, unsigned int number) {
+// Keeps a candidate, the one of a number, if it is near; `x` is where it is from the center.
+JFRNN_FUNCTION void keep(const PairSearch& search, bool is_near, const Place& candidate, const real* x, unsigned int number) {
     Warp& warp = shared_warp();
     if constexpr (!MATRIX) {
         if (is_near) {
@@ -44,12 +42,8 @@ JFRNN_FUNCTION void keep(
             if (is_near)
                 search.cutoffs_of(search.source_named(id_of(candidate.id)), &warp.candidates[4][number % RING]);
     }
-    if constexpr (!HELD || NAMED_APART) {
-        const int name = HELD ? source : id_of(candidate.id);
-        store_if(is_near, shared_address(warp.candidate_ids) + 4 * (number % RING), (unsigned int)name);
-    }
-    if constexpr (HELD)
-        store_if(is_near, shared_address(warp.ids) + 4 * number, (unsigned int)id_of(candidate.id));
+    const unsigned int to = HELD ? shared_address(warp.ids) + 4 * number : shared_address(warp.candidate_ids) + 4 * (number % RING);
+    store_if(is_near, to, (unsigned int)id_of(candidate.id));
 }
 
 struct Candidates {
@@ -57,7 +51,6 @@ struct Candidates {
     int run_end, run_shift;  // of what this lane fetches
     const Run* run;
     Place places[FETCHED];
-    int sources[FETCHED];  // where they are NAMED_APART
     int runs_of[FETCHED];  // crossing: nothing may wait here for what is loaded, so that it is moved later
 
     JFRNN_MEMBER Candidates() : total(0), fetched(0), run_end(0), run_shift(0), run(shared_warp().runs) {}
@@ -94,8 +87,6 @@ struct Candidates {
                 taken = taken && (warp.run_images[runs_of[k]] != search.home || (unsigned int)(at - group.place) >= queries);
             }
             load_if(taken, search.sorted + at, places[k]);
-            if constexpr (NAMED_APART)
-                sources[k] = id_of(places[k].id);
             if constexpr (SUMS)
                 places[k].id = bits_as_real(at);
         }
@@ -129,8 +120,7 @@ struct Candidates {
 #pragma unroll
         for (int k = 0; k < FETCHED; ++k) {
             const unsigned int all_near = __ballot_sync(ALL, near[k]);
-            keep(search, near[k], places[k], NAMED_APART ? sources[k] : 0, x[k],
-                pairs.kept + __popc(all_near & ((1u << search.lane) - 1)));
+            keep(search, near[k], places[k], x[k], pairs.kept + __popc(all_near & ((1u << search.lane) - 1)));
             pairs.kept += __popc(all_near);
         }
         fetched += 32 * FETCHED;
@@ -172,8 +162,7 @@ JFRNN_FUNCTION void keep_untested(const PairSearch& search, const Group& group, 
         for (int a = 0; a < DIM; ++a)
             x[a] = group.from_center(left[k].p[a], warp.box.center[a]);
         const bool is_left = 32 * k + search.lane < pairs.kept;
-        keep(
-            search, is_left, left[k], NAMED_APART && is_left ? search.source_named(id_of(left[k].id)) : 0, x, 32 * k + search.lane);
+        keep(search, is_left, left[k], x, 32 * k + search.lane);
     }
 }
 

@@ -11,14 +11,14 @@ JFRNN_FUNCTION Place load(const Place* from) {
         return Place{{(real)a.x, (real)a.y, (real)a.z}, (real)a.w};
     }
 }
-// Loads a place by a predicate. Sums need no id, if nothing is excluded, so it is not loaded: its register would be given to another
+// Loads a place by a predicate. Sums need no id, so it is not loaded: its register would be given to another
 // value, which would wait for the load.
 template <class AnyPlace>
 JFRNN_FUNCTION void load_if(bool is_loaded, const Place* from, AnyPlace& to) {
     if constexpr (sizeof(to.id) == 8) {
         if (is_loaded)
             to = load(from);
-    } else if constexpr (SUMS && !EXCLUDING)
+    } else if constexpr (SUMS)
         asm volatile(
             "{.reg .pred is; setp.ne.u32 is, %3, 0; @is ld.global.nc.f32 %0, [%4];"
             "@is ld.global.nc.f32 %1, [%4 + 4]; @is ld.global.nc.f32 %2, [%4 + 8];}"
@@ -98,6 +98,14 @@ struct ImageSearch : Search {
             moved[k] = lattice.translation(shift[0], shift[1], shift[2], k);
     }
     JFRNN_MEMBER int source_named(int id) const { return SUMS ? id_of(__ldg(&sorted[source_of(id)].id)) : source_of(id); }
+    // The same, loaded now: the compiler would put it off until it is used.
+    JFRNN_MEMBER int source_named_now(int id) const {
+        if constexpr (!SUMS)
+            return source_of(id);
+        int name;
+        asm volatile("ld.global.nc.b32 %0, [%1];" : "=r"(name) : "l"(__cvta_generic_to_global(&sorted[source_of(id)].id)));
+        return name;
+    }
     // How rows of what queries exclude name a candidate of a source (excluded.h).
     JFRNN_MEMBER int excluded_id(int id, int source) const {
         if constexpr (EXCLUDING == 2)

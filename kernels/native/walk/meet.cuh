@@ -112,22 +112,18 @@ JFRNN_FUNCTION unsigned int find_met(const PairSearch& search, const Group& grou
     }
     return met;
 }
-// Returns which of the neighbors in a block of so many candidates a query does not exclude. Few candidates stand in the row of any query
-// of the group: the others are told apart by one lane each.
-JFRNN_FUNCTION unsigned int drop_excluded(
-    const PairSearch& search, const Group& group, const int* ids, const int* sources, int size, unsigned int hits) {
+// Returns which of the neighbors in a block of candidates a query does not exclude. Few candidates stand in the row of any query of the
+// group: the others are told apart by one lane each, which has the name of one, or NOBODY.
+JFRNN_FUNCTION unsigned int drop_excluded(const PairSearch& search, const Group& group, int name, unsigned int hits) {
     const Warp& warp = shared_warp();
-    const int lane = search.lane;
-    auto named = [&](int j) { return search.excluded_id(ids[j], NAMED_APART ? sources[j] : search.source_named(ids[j])); };
-    const bool by_any = lane < size && warp.excluded_by_any.may_have(named(lane));
-    const int* const kept = warp.excluded[lane];
-    for (unsigned int rest = hits & __ballot_sync(ALL, by_any); rest; rest &= rest - 1) {
-        const int j = __ffs(rest) - 1, id = named(j);
-        bool found =
-            kept[0] == Excluded::MANY && Excluded(search.excluded_starts, search.excluded, group.my_id, warp.filters[lane]).has(id);
-#pragma unroll
-        for (int k = 0; k < Excluded::MOST_KEPT; ++k)
-            found |= kept[k] == id;
+    const bool by_any = name != Excluded::NOBODY && warp.excluded_by_any.may_have(name);
+    for (unsigned int rest = __ballot_sync(ALL, by_any); rest; rest &= rest - 1) {
+        const int j = __ffs(rest) - 1, id = __shfl_sync(ALL, name, j);
+        if (!(hits >> j & 1))
+            continue;
+        const Excluded::Kept& kept = warp.excluded[search.lane];
+        const bool found =
+            kept.are_many() ? Excluded(search.excluded_starts, search.excluded, group.my_id, kept.filter()).has(id) : kept.has(id);
         hits &= found ? ~(1u << j) : ALL;
     }
     return hits;
@@ -159,6 +155,9 @@ JFRNN_FUNCTION void meet_block(
     const unsigned int first_candidate = pairs.tested % RING;
     const int* const ids = HELD ? warp.ids + pairs.tested : warp.candidate_ids + first_candidate;
     const unsigned int met = find_met(search, group, pairs, ids);
+    int name = Excluded::NOBODY;  // of the candidate of this lane, if there is one
+    if (EXCLUDING && pairs.tested + search.lane < pairs.kept)
+        name = search.excluded_id(ids[search.lane], search.source_named_now(ids[search.lane]));
     BlockBits block;
     if constexpr (VARY && !MATRIX)
         block = meet_by_cutoffs(search, group.mine.p, first_candidate);
@@ -190,7 +189,7 @@ JFRNN_FUNCTION void meet_block(
         aside.take_back(candidates, matrix);
     }
     if constexpr (EXCLUDING)
-        hits = drop_excluded(search, group, ids, warp.candidate_ids + first_candidate, pairs.kept - pairs.tested, hits);
+        hits = drop_excluded(search, group, name, hits);
     pairs.found += __popc(hits);
     if constexpr (HELD) {
         warp.hits[pairs.tested / 32][search.lane] = hits;

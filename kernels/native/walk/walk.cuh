@@ -74,10 +74,13 @@ struct Walk : PairSearch {
     JFRNN_MEMBER void walk(Group& group, bool& loose) {
         if constexpr (DIFFER)
             this->take_cutoffs(group.my_id, lane < group.size);
+        const bool is_query = lane < group.size;
+        const Excluded mine(excluded_starts, excluded, is_query ? group.my_id : 0, 0);  // it takes long to load
         group.enclose(*this);
+        const Excluded::Kept kept = mine.kept();
         Runs runs(*this, group, loose);
         if constexpr (EXCLUDING)
-            keep_excluded(group);
+            keep_excluded(mine, kept, is_query);
         Pairs pairs{0, 0, 0, 0, own && drop_self, true};
         if constexpr (LIST)
             shared_warp().written[lane] = 0;
@@ -114,19 +117,23 @@ struct Walk : PairSearch {
         query().done(group, pairs.found);
     }
     // Keeps what the queries exclude.
-    JFRNN_MEMBER void keep_excluded(const Group& group) {
+    JFRNN_MEMBER void keep_excluded(const Excluded& mine, const Excluded::Kept& kept, bool is_query) {
         Warp& warp = shared_warp();
-        const Excluded mine(excluded_starts, excluded, lane < group.size ? group.my_id : 0);
-        warp.filters[lane] = mine.filter;
-        mine.keep(warp.excluded[lane]);
         using OfAny = Excluded::OfAny;
         unsigned int* const words = warp.excluded_by_any.bits;
+        const bool any_is_long = __any_sync(ALL, mine.end - mine.begin > Excluded::SHORT);
+        warp.excluded[lane] = kept;
         for (int w = lane; w < OfAny::WORDS; w += 32)
-            words[w] = __any_sync(ALL, mine.end - mine.begin > Excluded::SHORT) ? ALL : 0;
+            words[w] = any_is_long ? ALL : 0;
         __syncwarp();
-        const bool is_short = lane < group.size && mine.end - mine.begin <= Excluded::SHORT;
-        for (const int* id = mine.begin; is_short && id < mine.end; ++id)
-            atomicOr(words + OfAny::word_of(*id), OfAny::bit_of(*id));
+        auto add = [&](int id) { atomicOr(words + OfAny::word_of(id), OfAny::bit_of(id)); };
+        if (is_query && kept.are_many())
+            for (const int* id = mine.begin; !any_is_long && id < mine.end; ++id)
+                add(*id);
+        else if (is_query)
+            for (int k = 0; k < Excluded::MOST_KEPT; ++k)
+                if (kept.ids[k] != Excluded::NOBODY)
+                    add(kept.ids[k]);
         __syncwarp();
     }
     // Makes rows of a matrix of the queries and, if they are sources, keeps them as the first candidates: the number is the lane.
@@ -141,7 +148,7 @@ struct Walk : PairSearch {
             Place at_home = group.mine;
             if constexpr (PERIODIC == 2 || SUMS)
                 at_home.id = bits_as_real(id_of_image(SUMS ? group.place + lane : group.my_id, home));
-            keep(*this, lane < group.size, at_home, group.my_id, x, lane);
+            keep(*this, lane < group.size, at_home, x, lane);
             pairs.kept = group.size;
         }
     }

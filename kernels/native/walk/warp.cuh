@@ -9,7 +9,6 @@ constexpr int LISTED = 32;           // neighbors of a query that are written at
 constexpr int FETCHED = 2;           // candidates that a lane fetches at a time
 constexpr bool MATRIX = !DOUBLE && (!VARY || RULE == TABLE);  // queries meet candidates on tensor cores, else one by one
 constexpr int OF_CUTOFFS = BANDED ? 2 : VARY ? 1 : 0;         // numbers that are known of a candidate where cutoffs VARY
-constexpr bool NAMED_APART = SUMS && EXCLUDING;               // candidates are places, and what is excluded are sources
 constexpr int LEAVES = 256;                                   // of a tree, that are written down at a time
 constexpr int RING = 128;  // candidates that wait: fewer than a block, and what is fetched twice, rounded up
 
@@ -28,14 +27,13 @@ struct alignas(16) Warp {
         // Per query, while rows are written: addresses of the ids that are next, two in a word; the stride is odd, for the banks.
         unsigned int lists[SUMS ? 1 : 32][LISTED / 2 + 3];
     };
-    alignas(16) int candidate_ids[HELD && !NAMED_APART ? 4 : RING];  // or, where these are NAMED_APART, their sources
-    alignas(16) int ids[HELD ? 32 * (BLOCKS + FETCHED) : 1];         // of all candidates since pairs were last settled
-    unsigned int hits[HELD ? BLOCKS + 1 : 1][32];                    // per block of candidates and query: one bit per candidate
+    alignas(16) int candidate_ids[HELD ? 4 : RING];
+    alignas(16) int ids[HELD ? 32 * (BLOCKS + FETCHED) : 1];  // of all candidates since pairs were last settled
+    unsigned int hits[HELD ? BLOCKS + 1 : 1][32];             // per block of candidates and query: one bit per candidate
     unsigned int written[LIST ? 32 : 1];  // per query: neighbors that stand in its row, a multiple of four, plus those left over
     int left[LIST ? 3 : 1][32];           // the ids of those left over
-    unsigned long long filters[EXCLUDING ? 32 : 1];  // of the rows that queries exclude (excluded.h)
     Excluded::OfAny excluded_by_any;
-    int excluded[EXCLUDING ? 32 : 1][Excluded::MOST_KEPT];  // what stands in them, where that is little
+    Excluded::Kept excluded[EXCLUDING ? 32 : 1];  // what queries exclude
     Box box;
     Run runs[33];
     int run_images[CROSSING ? 33 : 1];  // the codes of their images, and what leads from home to these

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 import jfrnn
-from jfrnn._engine import prepare_search
 from jfrnn._engine.operands import pack_particles
+from jfrnn._engine.problem import prepare_search
 from jfrnn._engine.renew_warp import constants_of, numbers_of_box
 from jfrnn._geometry import Status, make_cutoff
 from jfrnn._search import neighbor_list

@@ -1,0 +1,58 @@
+"""Particles in a box that kernels bring near it: rows, turns and what is met are those of array programs, bit by bit."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from checked import slow
+
+import jfrnn
+from jfrnn._engine.near_warp import prepare_for_kernels
+from jfrnn._engine.operands import as_integer, pack_particles
+from jfrnn._engine.problem import prepare_search
+from jfrnn._geometry import NOT_FINITE, TOO_FAR, unpack_turns
+from jfrnn._search.problem import Asked, check_problem
+
+LENGTHS = (10.0, 7.3, 1.7)
+BOUNDS = [22, 23, 24, 28, 29]  # reach, slack and turns: kernels bound the turns of all by their bits
+
+
+def prepared(prepare, x, queries, box):
+    """Return rows of sources and of queries, numbers of the lattice, and bits of what is met."""
+    problem, inputs = check_problem(Asked(x, 0.8, queries=queries, box=box, backend="warp"))
+
+    def pack(inputs):
+        search = prepare(inputs, problem.options)
+        return *pack_particles(search), search.torus[1].met
+
+    return [np.asarray(found) for found in jax.jit(pack)(inputs)]
+
+
+@pytest.mark.parametrize("spread", [1, 3, 200, 1e4, 1e7, 1e12])
+@pytest.mark.parametrize(("dim", "dtype"), [(3, np.float32), (2, np.float64), slow(2, np.float32), slow(3, np.float64)])
+def test_rows_are_those_of_array_programs(dim, dtype, spread):
+    rng, lengths = np.random.default_rng(dim), np.array(LENGTHS[:dim])
+    x = (rng.uniform(-1, 2, (500, dim)) * lengths * np.where(np.arange(500) % 7 > 0, 1, spread)[:, None]).astype(dtype)
+    x[::11] = (np.round(x[::11] / lengths * 2) / 2 * lengths).astype(dtype)  # at faces of boxes, and in the middle between these
+    x[5, 0], x[6, dim - 1] = (np.nan, -np.inf) if spread == 3 else x[5:7, 0]
+    periodic = (True, False, True)[:dim] if spread == 200 else True
+    for origin in (0.0, 0.3, 1e6 if dtype == np.float64 else 3e3):
+        box = jfrnn.Box(lengths.astype(dtype), periodic, origin=np.full(dim, origin, dtype))
+        for queries in (None, jnp.asarray(x[:50] + dtype(0.1))):
+            known = prepared(prepare_for_kernels, jnp.asarray(x), queries, box)
+            expected = prepared(prepare_search, jnp.asarray(x), queries, box)
+            for mine, theirs in zip(known[:2], expected[:2], strict=True):
+                np.testing.assert_array_equal(mine.view(f"i{mine.itemsize}"), theirs.view(f"i{mine.itemsize}"))
+            np.testing.assert_array_equal(np.delete(known[2], BOUNDS), np.delete(expected[2], BOUNDS))
+            assert (known[2][BOUNDS] >= expected[2][BOUNDS] * (1 - 4 * np.finfo(dtype).eps)).all()
+            met, others = int(known[3]), int(expected[3])
+            assert met & (NOT_FINITE | TOO_FAR) == others & (NOT_FINITE | TOO_FAR)
+            most = max(np.abs(unpack_turns(as_integer(jnp.asarray(rows[:, dim])), dim)).max() for rows in known[:2])
+            assert most <= met & (NOT_FINITE - 1) <= 2 * most
+
+
+def test_one_call_serves_a_search_and_its_checks():
+    """A sum of a program asks whether particles are too far away, which the call for its rows has found."""
+    x, box = jnp.asarray(np.random.default_rng(0).random((300, 3)), jnp.float32), jfrnn.Box([1.0, 1.0, 1.0])
+    program = jax.jit(lambda x: jfrnn.pair_sum(lambda r, i, j: r @ r, x, 0.2, box=box, backend="warp")).lower(x).compile()
+    assert program.as_text().count('kernel = "jfrnn_near') == 1
