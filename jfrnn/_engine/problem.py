@@ -212,13 +212,13 @@ def rows_asked(inputs: Inputs) -> tuple[Array, Array | None]:
     return inputs.sources, take_present(inputs).active
 
 
-Bring = Callable[[Array, geometry.Lattice], geometry.NearRows]  # points near a box that stands along the axes
+Bring = Callable[[Array, geometry.Lattice], geometry.NearRows]  # points near a box
 
 
 def prepare_search(inputs: Inputs, options: Options, bring: Bring | None = None) -> Search:
     """Prepare the operands for engines. No gradient flows through.
 
-    `bring` brings particles near a box that stands along the axes, if there is one for all; array programs do else.
+    `bring` brings particles near a box, if there is one for all, whose vectors are those that were given; array programs do else.
     """
     asked = lax.stop_gradient(inputs)
     given, queries, active, box, cutoff, batch, exclude = take_present(asked)
@@ -240,7 +240,7 @@ def prepare_search(inputs: Inputs, options: Options, bring: Bring | None = None)
     clouds, moved = [x for x in (sources, queries) if x is not None], None
     named = exclude is not None and exclude.rows.shifts is not None  # images, between points that were not moved
     brought = None
-    if bring is not None and not named and geometry.stands_along_axes(lattice):
+    if bring is not None and not named and not images.counts_short:
         # with the origin as it was given: XLA sees then that a search and its checks ask for the same
         box_as_given = dataclasses.replace(lattice, origin=jnp.asarray(box.origin).astype(sources.dtype))
         brought = [bring(x, box_as_given) for x in clouds]

@@ -72,7 +72,6 @@ from jfrnn._geometry.lattice import (
     nearest_shifts,
     shift_pairs,
     sides_of,
-    stands_along_axes,
     translation,
 )
 from jfrnn._geometry.meshes import merge_vertices

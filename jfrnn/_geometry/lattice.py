@@ -17,7 +17,7 @@ from jax import Array, lax
 from jfrnn._geometry.box import Box
 from jfrnn._geometry.exact import Shifted
 from jfrnn._geometry.far import is_far, move_near
-from jfrnn._geometry.floats import WHOLE_BITS, distill, half_mantissa
+from jfrnn._geometry.floats import WHOLE_BITS, distill, half_mantissa, rounded_product
 from jfrnn._geometry.images import Images
 from jfrnn._tracing import on_platform
 
@@ -268,17 +268,12 @@ class Near(NamedTuple):
     turns: Array
 
 
-def stands_along_axes(lattice: Lattice) -> bool:
-    """Say whether the vectors that are searched are those that were given, and lie along the axes."""
-    return lattice.images.orthogonal and not lattice.images.counts_short
-
-
 def bring_near(points: Array, lattice: Lattice) -> Near:
     """Move far points [n, d] near the box of a lattice, or each near that of its row (`jfrnn._geometry.far`).
 
     Differentiable in points and vectors. In lattices that are searched in short vectors, no points are moved.
     """
-    if stands_along_axes(lattice):
+    if lattice.images.orthogonal and not lattice.images.counts_short:
         return _bring_each_near(points, lattice)
     return _look_whether_far(points, lattice)
 
@@ -294,15 +289,18 @@ def _look_whether_far(points: Array, lattice: Lattice) -> Near:
 
 
 def _bring_each_near(points: Array, lattice: Lattice, rarely: bool = False) -> Near:
-    fixed = lax.stop_gradient(lattice)
-    units = units_of(lax.stop_gradient(points), fixed)
+    fixed, given = lax.stop_gradient((lattice, points))
+    # of skewed vectors in twice the precision, so that all programs, and kernels, find the same
+    units = units_of(given, fixed) if lattice.images.orthogonal else rounded_product(given, fixed.transform)
     periodic = fixed.spread(fixed.periodic, 2)
     return Near(*move_near(points, units, lattice.matrix, periodic, lattice.images.orthogonal, rarely))
 
 
 def _bring_near_if_any_is_far(points: Array, lattice: Lattice) -> Near:
     """Look first: to compute moves that nothing takes is as long as a search on a CPU; on a GPU it takes longer to ask."""
-    units = units_of(*lax.stop_gradient((points, lattice)))
+    given, fixed = lax.stop_gradient((points, lattice))
+    # at least as many vectors as they are away, but for rounding
+    units = units_of(jnp.abs(given), dataclasses.replace(fixed, transform=jnp.abs(fixed.transform)))
 
     def stay(points: Array, lattice: Lattice) -> Near:
         del lattice
@@ -310,7 +308,7 @@ def _bring_near_if_any_is_far(points: Array, lattice: Lattice) -> Near:
         return Near(jnp.where(none == 0, points, none), none)
 
     move = functools.partial(_bring_each_near, rarely=True)
-    return lax.cond(is_far(units).any(), move, stay, points, lattice)
+    return lax.cond(is_far(units * 1.001).any(), move, stay, points, lattice)
 
 
 def units_of(difference: Array, lattice: Lattice) -> Array:

@@ -28,27 +28,49 @@ def prepared(prepare, x, queries, box):
     return [np.asarray(found) for found in jax.jit(pack)(inputs)]
 
 
-@pytest.mark.parametrize("spread", [1, 3, 200, 1e4, 1e7, 1e12])
-@pytest.mark.parametrize(("dim", "dtype"), [(3, np.float32), (2, np.float64), slow(2, np.float32), slow(3, np.float64)])
-def test_rows_are_those_of_array_programs(dim, dtype, spread):
+def scene(dim, dtype, spread):
+    """Return points in a box and in those beside it, some of them further away, and some at faces of boxes or in the middle."""
     rng, lengths = np.random.default_rng(dim), np.array(LENGTHS[:dim])
     x = (rng.uniform(-1, 2, (500, dim)) * lengths * np.where(np.arange(500) % 7 > 0, 1, spread)[:, None]).astype(dtype)
-    x[::11] = (np.round(x[::11] / lengths * 2) / 2 * lengths).astype(dtype)  # at faces of boxes, and in the middle between these
+    x[::11] = (np.round(x[::11] / lengths * 2) / 2 * lengths).astype(dtype)
     x[5, 0], x[6, dim - 1] = (np.nan, -np.inf) if spread == 3 else x[5:7, 0]
-    periodic = (True, False, True)[:dim] if spread == 200 else True
+    return x
+
+
+def turns_in(rows, dim):
+    return np.asarray(unpack_turns(as_integer(jnp.asarray(rows[:, dim])), dim))
+
+
+SPREADS = [1, 3, 200, 1e4, 1e7, 1e12]
+KINDS = [(3, np.float32), (2, np.float64), slow(2, np.float32), slow(3, np.float64)]
+
+
+@pytest.mark.parametrize("spread", SPREADS)
+@pytest.mark.parametrize(("dim", "dtype"), KINDS)
+@pytest.mark.parametrize("skew", [0.0, slow(0.3), -0.7])
+def test_rows_are_those_of_array_programs(dim, dtype, spread, skew):
+    x, periodic = scene(dim, dtype, spread), (True, False, True)[:dim] if spread == 200 else True
+    vectors = np.diag(LENGTHS[:dim]) + np.diag([skew * LENGTHS[1]] * (dim - 1), 1)
     for origin in (0.0, 0.3, 1e6 if dtype == np.float64 else 3e3):
-        box = jfrnn.Box(lengths.astype(dtype), periodic, origin=np.full(dim, origin, dtype))
+        box = jfrnn.Box((vectors if skew else np.diag(vectors)).astype(dtype), periodic, origin=np.full(dim, origin, dtype))
         for queries in (None, jnp.asarray(x[:50] + dtype(0.1))):
             known = prepared(prepare_for_kernels, jnp.asarray(x), queries, box)
             expected = prepared(prepare_search, jnp.asarray(x), queries, box)
+            numbers, others = known[2], expected[2]
+            np.testing.assert_array_equal(np.delete(numbers, BOUNDS), np.delete(others, BOUNDS))
+            assert (numbers[BOUNDS] >= others[BOUNDS] * (1 - 4 * np.finfo(dtype).eps)).all()
             for mine, theirs in zip(known[:2], expected[:2], strict=True):
-                np.testing.assert_array_equal(mine.view(f"i{mine.itemsize}"), theirs.view(f"i{mine.itemsize}"))
-            np.testing.assert_array_equal(np.delete(known[2], BOUNDS), np.delete(expected[2], BOUNDS))
-            assert (known[2][BOUNDS] >= expected[2][BOUNDS] * (1 - 4 * np.finfo(dtype).eps)).all()
-            met, others = int(known[3]), int(expected[3])
-            assert met & (NOT_FINITE | TOO_FAR) == others & (NOT_FINITE | TOO_FAR)
-            most = max(np.abs(unpack_turns(as_integer(jnp.asarray(rows[:, dim])), dim)).max() for rows in known[:2])
-            assert most <= met & (NOT_FINITE - 1) <= 2 * most
+                np.testing.assert_array_equal(*(rows[:, :dim].copy().view(f"i{rows.itemsize}") for rows in (mine, theirs)))
+                asserted = mine[:, dim].view(f"i{mine.itemsize}") == theirs[:, dim].view(f"i{mine.itemsize}")
+                if skew:  # where products are contracted with sums, another vector may be counted at a face
+                    transform = others[10:19].reshape(3, 3)[:dim, :dim].astype(np.float64)
+                    with np.errstate(invalid="ignore"):
+                        units = (mine[:, :dim].astype(np.float64) - others[19 : 19 + dim]) @ transform
+                        asserted |= (np.abs(units - np.round(units)) < 1e-3 * (dtype == np.float32) + 1e-6).any(axis=1)
+                assert asserted.all()
+            assert int(known[3]) & (NOT_FINITE | TOO_FAR) == int(expected[3]) & (NOT_FINITE | TOO_FAR)
+            most = max(np.abs(turns_in(rows, dim)).max() for rows in known[:2])
+            assert most <= int(known[3]) & (NOT_FINITE - 1) <= 2 * most
 
 
 def test_one_call_serves_a_search_and_its_checks():
