@@ -173,7 +173,7 @@ struct CellRuns {
             image = image * (2 * most + 1) + shift[a] + most;
         }
         if (!within)
-            return CellRow{cell[0], cell[1], cell[2], 0, search.home};
+            return CellRow{0, 0, 0, 0, search.home};  // a cell there is
         return CellRow{cell[0], cell[1], cell[2], (int)(last - cell[0]) + 1, image};
     }
     // Finds what the row of this lane shares with those of the lanes before it.
