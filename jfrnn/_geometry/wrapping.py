@@ -49,8 +49,8 @@ class Wrapped(NamedTuple):
 
     @property
     def most_turns(self) -> Array:
-        """At least the largest number of turns along an axis, and less than twice that, as a float: 0 and 1 are exact."""
-        return (self.met & LARGEST_TURN).astype(self.slack.dtype)
+        """What `_most_turns` returns."""
+        return _most_turns(self.met, np.dtype(self.slack.dtype))
 
 
 class NearRows(NamedTuple):
@@ -97,6 +97,11 @@ def _met(packed: Array, dim: int) -> Array:
     return functools.reduce(jnp.bitwise_or, jnp.max(jnp.stack([x.astype(jnp.int32) for x in parts]), axis=1, initial=0))
 
 
+def _most_turns(met: Array, dtype: np.dtype) -> Array:
+    """Return at least the largest number of turns along an axis, and less than twice that, as a float: 0 and 1 are exact."""
+    return (met & LARGEST_TURN).astype(dtype)
+
+
 def unpack_turns(packed: Array, dim: int) -> Array:
     """Invert `pack_turns`: [..., d] int32, 0 for negative values."""
     places = np.arange(dim, dtype=np.int32) * _TURN_BITS
@@ -133,7 +138,7 @@ def wrap(
         moved = jnp.where((off == 0).all(axis=1, keepdims=True), points, points - translation(off, each))
         wrapped.append(jnp.where(turns[:, None] >= 0, moved, jnp.nan))
     met = functools.reduce(jnp.bitwise_or, found)
-    most = (met & LARGEST_TURN).astype(dtype)  # at least the largest number of turns, and less than twice that
+    most = _most_turns(met, dtype)
 
     largest = None
     if not (images.orthogonal or (lattice.flags is None and np.all(periodic))):

@@ -11,8 +11,8 @@ JFRNN_FUNCTION Place load(const Place* from) {
         return Place{{(real)a.x, (real)a.y, (real)a.z}, (real)a.w};
     }
 }
-// Loads a place by a predicate. Sums need no id, so it is not loaded: its register would be given to another
-// value, which would wait for the load.
+// Loads a place by a predicate. Sums need no id, so it is not loaded: its register would be given to another value, which would wait
+// for the load.
 template <class AnyPlace>
 JFRNN_FUNCTION void load_if(bool is_loaded, const Place* from, AnyPlace& to) {
     if constexpr (sizeof(to.id) == 8) {
