@@ -40,11 +40,11 @@ def _bring(points: Array, lattice: Lattice) -> NearRows:
     (n, dim), double, skewed = points.shape, points.dtype == jnp.float64, not lattice.images.orthogonal
 
     def on(cuda: bool) -> Callable[[Array, Array], list[Array]]:
-        dims = {"rows": (n, dim + 1), "met": 1, "info": 2}
+        dims = {"rows": (n, dim + 1), "met": 2, "info": 2}
         return lambda *given: _callable(dim, double, skewed, cuda)(*given, output_dims=dims)[:2]
 
     rows, met = on_platform(points, numbers_of_pairs(np.float64(0), lattice), cpu=on(False), cuda=on(True))
-    return NearRows(rows, rows[:, :dim], as_integer(rows[:, dim]), met[0])
+    return NearRows(rows, rows[:, :dim], as_integer(rows[:, dim]), jnp.bitwise_or(met[0], met[1]))
 
 
 @kernel
@@ -52,8 +52,8 @@ def _callable(dim: int, double: bool, skewed: bool, cuda: bool) -> Call:
     def plan(shapes: Shapes, multiprocessors: int) -> Plan:
         n, found = shapes["points"][0], near.near_kernel(dim, double, skewed, tuple(constants_of_far(double).items()), cuda)
         if cuda:
-            return Plan([Clear("met", 4), Launch(found, near.threads(n, multiprocessors))], {"n": n})
-        return Plan([Clear("met", 4), Clear("info", 8), share(found, n, near.POINTS_AT_ONCE)], {"n": n})
+            return Plan([Clear("met", 8), Launch(found, near.threads(n, multiprocessors))], {"n": n})
+        return Plan([Clear("met", 8), Clear("info", 8), share(found, n, near.POINTS_AT_ONCE)], {"n": n})
 
     name = f"jfrnn_near_{'cuda' if cuda else 'cpu'}_{dim}d_{'f64' if double else 'f32'}{'_skewed' * skewed}"
     results = {"rows": scalar_of(Kind(dim, double)), "met": np.int32, "info": np.int32}

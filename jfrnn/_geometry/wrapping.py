@@ -17,7 +17,7 @@ from jfrnn._geometry.images import LARGEST_TURN
 from jfrnn._geometry.lattice import Lattice, add_rows, fractions_of, largest_component, product, translation
 
 _TURN_BITS = 10
-NOT_FINITE, TOO_FAR = 1 << _TURN_BITS, 2 << _TURN_BITS
+NOT_FINITE, TOO_FAR, _MOST_TURNS = 1 << _TURN_BITS, 2 << _TURN_BITS, (1 << _TURN_BITS) - 1
 
 
 class Wrapped(NamedTuple):
@@ -32,7 +32,7 @@ class Wrapped(NamedTuple):
         reach: [d] the largest distance of a pair along each axis, in fractional coordinates (lengths along open axes).
         margin: [d] the part of `reach` that does not depend on the cutoff.
         enough: [] bool, whether no pair needs other images than those considered.
-        met: [] int32, the bits `NOT_FINITE` and `TOO_FAR` if there are such particles; the lower bits bound the turns.
+        met: [] int32, the bits `NOT_FINITE` and `TOO_FAR` if there are such particles; the lower bits are the most turns.
         rows: Rows of sources and of queries, if a kernel has brought them near.
     """
 
@@ -88,7 +88,7 @@ def count_turns(points: Array, lattice: Lattice) -> Array:
 
 
 def _met(packed: Array, dim: int) -> Array:
-    """Return a bound on the number of turns, and the bits for points out of range, [] int32.
+    """Return the most turns along an axis, and the bits for points out of range, [] int32.
 
     This is one reduction, which XLA supports across devices; it has no bitwise one for integers.
     """
@@ -97,9 +97,15 @@ def _met(packed: Array, dim: int) -> Array:
     return functools.reduce(jnp.bitwise_or, jnp.max(jnp.stack([x.astype(jnp.int32) for x in parts]), axis=1, initial=0))
 
 
+def _joined(met: list[Array]) -> Array:
+    """Return what is met of all: the most turns, and the bits of each."""
+    most = functools.reduce(jnp.maximum, (x & _MOST_TURNS for x in met))
+    return functools.reduce(jnp.bitwise_or, (x & ~_MOST_TURNS for x in met), most)
+
+
 def _most_turns(met: Array, dtype: np.dtype) -> Array:
-    """Return at least the largest number of turns along an axis, and less than twice that, as a float: 0 and 1 are exact."""
-    return (met & LARGEST_TURN).astype(dtype)
+    """Return the largest number of turns along an axis, as a float."""
+    return (met & _MOST_TURNS).astype(dtype)
 
 
 def unpack_turns(packed: Array, dim: int) -> Array:
@@ -137,7 +143,7 @@ def wrap(
         off = unpack_turns(turns, dim).astype(dtype)
         moved = jnp.where((off == 0).all(axis=1, keepdims=True), points, points - translation(off, each))
         wrapped.append(jnp.where(turns[:, None] >= 0, moved, jnp.nan))
-    met = functools.reduce(jnp.bitwise_or, found)
+    met = _joined(found)
     most = _most_turns(met, dtype)
 
     largest = None

@@ -12,20 +12,23 @@ from jax import Array, lax
 from jax.core import Tracer
 
 from jfrnn import _geometry as geometry
-from jfrnn._engine import Inputs, Options, find_bits, hide_inactive, rows_asked
+from jfrnn._engine import ARRAYS, Inputs, Options, find_bits, hide_inactive, rows_asked
 from jfrnn._search import MOST_SLOTS, EdgeList, NeighborList, Problem, find_ends, kept_list, lattice_of_rows
 from jfrnn._sums.extremes import bind_extremes
 from jfrnn._sums.pair_function import call_with_pair
-from jfrnn._sums.relations import Flat, Kept, Listed, Relation, Searched
+from jfrnn._sums.relations import Flat, Kept, Listed, Relation, Searched, is_fused
 from jfrnn._sums.summation import bind_sum
 from jfrnn._sums.terms import OF_QUERIES, OF_SOURCES, Groups, Summand, Term, choose, fresh_labels, trace
 from jfrnn._tracing import Given, Points, Tree, call_apart, compile_program, on_device
+
+Marked = tuple[Array, Array, Callable[[list[Array]], list[Array]]]  # what `_prepare_marks` returns
 
 
 class Pairs(NamedTuple):
     """The pairs of a sum and the operands of their displacements.
 
-    `mark` replaces sums by NaN (integers: the smallest one) in invalid rows: where pairs may be missing, and where the position of
+    `mark`, of the term that is summed, returns sources and rows whose derivatives are NaN in invalid rows, and a function that
+    replaces sums there by NaN (integers: the smallest one). Rows are invalid where pairs may be missing, and where the position of
     an active particle is not finite. None: nothing else makes rows invalid, so the sums mark them themselves.
     """
 
@@ -36,7 +39,7 @@ class Pairs(NamedTuple):
     lattice: geometry.Lattice | None
     largest: Any  # the largest cutoff
     directionless: bool
-    mark: Callable[[list[Array]], list[Array]] | None
+    mark: Callable[[Term], Marked] | None
     sides: Array | None = None  # of the lattice, where they are known
 
 
@@ -55,14 +58,18 @@ def pairs_of_search(problem: Problem, inputs: Inputs, summed: bool) -> Pairs:
     sources, queries = _bring_near(sources, queries, box, options.images, batch)
     unsure = (exclude is not None and exclude.valid is not None) or (batch is not None and batch.fit is not None)
     doubtful = by_data = several or box is not None or unsure
-    if doubtful:
+    if doubtful and not any(isinstance(x, Tracer) for x in jax.tree.leaves(inputs)):
         known = geometry.known_status(call_apart(lambda inputs: find_bits(inputs, options), inputs))
         problem.refuse(known, inputs)
         doubtful = known is None
-    if summed and active is None and not by_data:
-        return Pairs(relation, False, sources, sources if queries is None else queries, lattice, largest, relation.symmetric, None)
-    sources, rows, mark = _prepare_marks(sources, queries, _good_rows_of_search, (inputs,), (options, doubtful))
-    return Pairs(relation, False, sources, rows, lattice, largest, relation.symmetric, mark, sides)
+
+    def mark(term: Term) -> Marked:
+        asked = options if is_fused(relation, term) else options._replace(engine=ARRAYS)  # no kernel is called for it alone
+        return _prepare_marks(sources, queries, _good_rows_of_search, (inputs,), (asked, doubtful))
+
+    plain = summed and active is None and not by_data
+    rows = sources if queries is None else queries
+    return Pairs(relation, False, sources, rows, lattice, largest, relation.symmetric, None if plain else mark, sides)
 
 
 def pairs_of_list(
@@ -103,8 +110,11 @@ def pairs_of_list(
     masked = nbrs.masked or (nbrs.box is not None and nbrs.box.per_system)
     held = (nbrs.count if isinstance(nbrs, NeighborList) else jnp.diff(nbrs.offsets)) if masked and not own else None
     data, harmless = (nbrs.status, held, fixed_rows), (nbrs._harmless,)
-    sources, rows, mark = _prepare_marks(sources, rows if own else None, _good_rows_of_list, data, harmless)
     sides = sides if known is None else known.sides
+
+    def mark(_: Term) -> Marked:
+        return _prepare_marks(sources, rows if own else None, _good_rows_of_list, data, harmless)
+
     return Pairs(relation, nbrs.half, sources, rows, lattice, largest, directionless, mark, sides)
 
 
@@ -141,7 +151,7 @@ def _good_rows_of_list(status: Array, count: Array | None, points: Array, harmle
 
 def _prepare_marks(
     sources: Array, queries: Array | None, are_good: Callable[..., Array], data: tuple, static: tuple = ()
-) -> tuple[Array, Array, Callable[[list[Array]], list[Array]]]:
+) -> Marked:
     """Return sources, rows and a function that marks invalid rows; derivatives in invalid rows of the positions are NaN.
 
     `are_good(*data, *static)` says which rows are valid. For concrete arrays one program evaluates and applies it.
@@ -224,6 +234,10 @@ def reduce_pairs(
     if pairs.rows is not pairs.sources or mine is not theirs:
         labels = (OF_QUERIES, *fresh_labels(len(operands.own) - 1, ((), theirs_first))), theirs_first
     term, needed, closed_over = trace(summand, one_pair, shift, labels, fn, pairs.mark is None)
+    finish = None
+    if pairs.mark is not None:
+        sources, rows, finish = pairs.mark(term)
+        operands = operands._replace(own=(rows, *operands.own[1:]), others=(sources, *operands.others[1:]))
     if reduce != "sum" and not all(jnp.issubdtype(x.dtype, jnp.floating) for x in term.summands):
         raise TypeError(f"fn must return floats for reduce={reduce!r}, whose rows may be infinite: convert them with .astype.")
     operands = choose(operands, needed)
@@ -238,7 +252,7 @@ def reduce_pairs(
         leaves = _sums_of_half(pairs.relation, term, operands, compensated)
     else:
         leaves = bind_sum(pairs.relation, term, operands, compensated)
-    leaves = leaves if pairs.mark is None else pairs.mark(leaves)
+    leaves = leaves if finish is None else finish(leaves)
     return jax.tree.unflatten(structure[0], leaves)
 
 

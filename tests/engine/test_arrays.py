@@ -190,6 +190,15 @@ def test_programs_are_exported_for_every_platform():
     assert set(re.findall(r"custom_call @(\w+)", str(program.mlir_module()))) <= {"Sharding", "annotate_device_placement"}
 
 
+@pytest.mark.filterwarnings("ignore:backend='auto' takes the slower engine:RuntimeWarning")
+def test_a_sum_that_has_no_translation_calls_no_kernel():
+    """Checks of particles in a box are array programs where the sum is one, whatever serves others here."""
+    box = jfrnn.Box([1.0, 1.0, 1.0])
+    program = jax.jit(lambda x: jfrnn.pair_sum(lambda r, i, j: jnp.sort(r)[0], x, 0.2, box=box))
+    text = jax.export.export(program, platforms=["cpu", "tpu"])(jax.ShapeDtypeStruct((500, 3), np.float32)).mlir_module()
+    assert "custom_call" not in str(text)
+
+
 def searched(x):
     return jfrnn.search(x, 0.2, capacity=64, backend="jax").idx
 

@@ -6,7 +6,7 @@
 struct NearArguments {
     const real *points, *cutoff;  // [n, DIM], and the lattice
     real* rows;                   // written: [n, DIM + 1]
-    int *met, *info;              // [1] 0 before, what was met of any (near.h); scratch of the CPU, of 0
+    int *met, *info;              // [2] 0 before, of which the bits say what was met of any (near.h); scratch of the CPU, of 0
     int n;
 };
 
@@ -21,10 +21,13 @@ struct NearRows : NearArguments {
     JFRNN_MEMBER void run() const {
         int found = 0;
         for (long long i = thread_index(); i < n; i += (long long)gridDim.x * blockDim.x)
-            found |= write(i);
-        found = __reduce_or_sync(0xffffffff, found);
-        if (found && threadIdx.x % 32 == 0)
-            atomicOr(met, found);
+            found = Near::joined(found, write(i));
+        const int turns = __reduce_max_sync(0xffffffff, found & Near::MOST_TURNS);
+        const int bits = __reduce_or_sync(0xffffffff, found & ~Near::MOST_TURNS);
+        if (turns && threadIdx.x % 32 == 0)
+            atomicMax(met, turns);
+        if (bits && threadIdx.x % 32 == 0)
+            atomicOr(met + 1, bits);
     }
 #else
     const FloatControl floats;
@@ -35,9 +38,11 @@ struct NearRows : NearArguments {
         each_chunk(*info, n, CHUNK, [&](int from, int to, int) {
             int found = 0;
             for (int i = from; i < to; ++i)
-                found |= write(i);
-            if (found)
-                __atomic_fetch_or(met, found, __ATOMIC_RELAXED);
+                found = Near::joined(found, write(i));
+            int known = __atomic_load_n(met, __ATOMIC_RELAXED), both;
+            do
+                both = Near::joined(known, found);
+            while (both != known && !__atomic_compare_exchange_n(met, &known, both, true, __ATOMIC_RELAXED, __ATOMIC_RELAXED));
         });
     }
 #endif

@@ -13,6 +13,7 @@ JFRNN_FUNCTION real whole_below(real x) { return DOUBLE ? floor(x) : floorf(x); 
 #endif
 
 struct Near {
+    static constexpr int MOST_TURNS = MET_NOT_FINITE - 1;  // what is met has its bits above
     const Lattice lattice;
     // What all points ask for is copied, since CUDA would load it anew for each of them.
     real transform[3][3];
@@ -112,8 +113,13 @@ struct Near {
             sum = Lattice::add(sum, Lattice::mul(Lattice::add(p[k], -origin[k]), transform[k][axis]));
         return whole_below(sum);
     }
-    // Writes a row of a particle that was brought near: the point and its packed turns; returns what was met: bits of these, or that
-    // the point is not finite, or too far away (jfrnn/_geometry/wrapping.py).
+    // What was met of two rows: the larger number of turns, and the bits of both.
+    JFRNN_FUNCTION int joined(int a, int b) {
+        const int turns_a = a & MOST_TURNS, turns_b = b & MOST_TURNS;
+        return (turns_a > turns_b ? turns_a : turns_b) | ((a | b) & ~MOST_TURNS);
+    }
+    // Writes a row of a particle that was brought near: the point and its packed turns; returns what was met: the most turns along an
+    // axis, or that the point is not finite, or too far away (jfrnn/_geometry/wrapping.py).
     JFRNN_MEMBER int write_row(const real* p, real* row) const {
         int packed = 0, met = 0;
         bool near = true;
@@ -122,7 +128,7 @@ struct Near {
             near &= size_of(turns) <= LARGEST_TURN;
             const int whole_turns = near ? (int)turns : 0;
             packed |= (whole_turns + 512) << (10 * k);
-            met |= whole_turns < 0 ? -whole_turns : whole_turns;
+            met = joined(met, whole_turns < 0 ? -whole_turns : whole_turns);
         }
         if (!finite_point(p)) {
             packed = -1;
