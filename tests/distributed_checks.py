@@ -386,7 +386,7 @@ def particles_that_are_nowhere_stay():
     nbrs = distributed.search(particles, 0.3, capacity=40, backend="warp")
     raises(ValueError, "non-finite", nbrs.check)
     assert jfrnn.Status(int(nbrs.status)) == jfrnn.Status.NONFINITE
-    expected = jfrnn.count(jnp.asarray(x), 0.3, backend="warp")
+    expected = jfrnn.search(jnp.asarray(x), 0.3, capacity=40, backend="warp").count
     np.testing.assert_array_equal(by_id(nbrs.count, particles), expected)
     for given in ({"cutoff": 0.3}, {"cutoff": None, "neighbors": nbrs}):
         sums = by_id(distributed.pair_sum(weight, particles, **given), particles)

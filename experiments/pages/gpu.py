@@ -121,12 +121,12 @@ def sent() -> str:
 def two_devices() -> str:
     """Return milliseconds on one and two GPUs of one host."""
     titles = {"list": "list", "pair_sum": "density", "sph": "step of the solver"}
-    rows = [*read("distributed/h200_x2.jsonl"), *read("distributed/h200_x2_64m.jsonl")]
+    rows = [row for size in ("_16m", "", "_64m") for row in read(f"distributed/h200_x2{size}.jsonl")]
     lines = []
     for alone in (row for row in rows if row["devices"] == 1):
         both = [r for r in rows if r["devices"] == 2 and (r["work"], r["scaling"]) == (alone["work"], alone["scaling"])]
-        ratio = 1.0 if alone["scaling"] == "strong" else 1.5
-        pair = next(r for r in both if ratio <= r["particles"] / alone["particles"] <= 2)
+        least, most = (1.0, 1.0) if alone["scaling"] == "strong" else (1.5, 2.0)
+        pair = next(r for r in both if least <= r["particles"] / alone["particles"] <= most)
         speed = [row["particles"] / row["median_s"] / row["devices"] for row in (alone, pair)]
         scaling = "the same on two" if alone["scaling"] == "strong" else "as many on each of two"
         work = [titles[alone["work"]], scaling, whole(alone["particles"]), _ms(alone), whole(pair["particles"]), _ms(pair)]
