@@ -16,6 +16,11 @@ struct KeptSums : KeptRows<KeptSums> {
         const Term::Own own_part = term.own(own_numbers(own_values, row), own.q);
         const Term term = this->term;  // a variable, which stays in registers
         Reduction reduction(n);
+        auto names = [&](int first, int lane, int& source, int& place) {
+            int code;
+            place = first + lane;
+            read_entry(first_entry(row) + place, source, code);
+        };
         walk(row, own, [&](const KeptSlots& some) {
             if (some.pairs == 0)
                 return;
@@ -27,14 +32,9 @@ struct KeptSums : KeptRows<KeptSums> {
                 term.evaluate<true>(own_part, some.numbers, column, summand);
             else
                 term.evaluate<false>(own_part, some.numbers, column, summand);
-            reduction.add(summand, flags_of(some.pairs), [&](Math::i32& source, Math::i32& code) {
-                for (int l = 0; l < LANES; ++l) {
-                    source[l] = some.ids[l];
-                    code[l] = some.places + l;
-                }
-            });
+            reduction.add(summand, flags_of(some.pairs), some.places, names);
         });
-        reduction.store(results, row, true, true);
+        reduction.store(results, row, true, true, names);
     }
     void finish_chunk(int chunk) { results.store_totals(chunk); }
 };

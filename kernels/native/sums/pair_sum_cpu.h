@@ -97,7 +97,7 @@ struct SumsBy : Way<SumsBy<Way>> {
             meet_packed<AT_HOME>(q, id, own_part, reduction);
         else
             meet_in_place<AT_HOME>(q, id, own_part, reduction);
-        reduction.store(results, id, fresh, finished);
+        reduction.store(results, id, fresh, finished, names());
     }
     template <bool AT_HOME>
     static constexpr bool has_column(int c) {
@@ -132,10 +132,7 @@ struct SumsBy : Way<SumsBy<Way>> {
             number summand[SUMMANDS];
             auto load = [&](int c) { return *(const number*)(column[c] + b); };
             term.evaluate<AT_HOME>(own_part, points.p, columns_of<AT_HOME>(points, load), summand);
-            reduction.add(summand, flags_of(hit), [&](Math::i32& source, Math::i32& code) {
-                for (int l = 0; l < LANES; ++l)
-                    name(b + l, l, source, code);
-            });
+            reduction.add(summand, flags_of(hit), b, names());
         }
         const int doubts = any_unsure ? collect_doubtful(filled) : 0;
         for (int b = 0; b < doubts; b += LANES) {
@@ -144,10 +141,7 @@ struct SumsBy : Way<SumsBy<Way>> {
             number summand[SUMMANDS];
             auto load = [&](int c) { return gathered(column[c], doubtful + b); };
             term.evaluate<AT_HOME>(own_part, points.p, columns_of<AT_HOME>(points, load), summand);
-            reduction.add(summand, flags_of(hit), [&](Math::i32& source, Math::i32& code) {
-                for (int l = 0; l < LANES; ++l)
-                    name(doubtful[b + l], l, source, code);
-            });
+            reduction.add(summand, flags_of(hit), ~b, names());
         }
     }
     // Packs what is near first, so that the term is evaluated for hardly more than the pairs.
@@ -185,16 +179,16 @@ struct SumsBy : Way<SumsBy<Way>> {
             number summand[SUMMANDS];
             auto load = [&](int c) { return *(const number*)(near_column[c] + b); };
             term.evaluate<AT_HOME>(own_part, points.p, columns_of<AT_HOME>(points, load), summand);
-            reduction.add(summand, flags_of(hit), [&](Math::i32& source, Math::i32& code) {
-                for (int l = 0; l < LANES; ++l)
-                    name(doubtful[b + l], l, source, code);
-            });
+            reduction.add(summand, flags_of(hit), ~b, names());
         }
     }
-    // Names the candidate of a number in a lane.
-    void name(int number_of_it, int l, Math::i32& source, Math::i32& code) const {
-        source[l] = candidate_ids[number_of_it];
-        code[l] = PERIODIC && several ? candidate_images[number_of_it] : image;
+    // Tells who a candidate is, and of which image: that of a lane behind the first of a vector, or behind a place in `doubtful`.
+    auto names() const {
+        return [this](int first, int lane, int& source, int& code) {
+            const int number_of_it = first < 0 ? doubtful[~first + lane] : first + lane;
+            source = candidate_ids[number_of_it];
+            code = PERIODIC && several ? candidate_images[number_of_it] : image;
+        };
     }
 };
 struct Sums {

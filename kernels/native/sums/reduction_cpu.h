@@ -62,7 +62,7 @@ struct Added {
     }
     // Adds the summands of those lanes that are pairs.
     template <class Names>
-    JFRNN_INLINE void add(const number* summand, Math::flag pairs, Names) {
+    JFRNN_INLINE void add(const number* summand, Math::flag pairs, int, Names) {
 #pragma unroll
         for (int k = 0; k < SUMMANDS; ++k) {
             const number x = Math::select(pairs, summand[k], number{});
@@ -88,7 +88,8 @@ struct Added {
         carried += e[0];
     }
     // Adds to what the query has already, and to the totals of the chunk; `fresh`: the query has nothing yet.
-    JFRNN_INLINE void store(Results& results, int id, bool fresh, bool finished) {
+    template <class Names>
+    JFRNN_INLINE void store(Results& results, int id, bool fresh, bool finished, Names) {
         four plain[(SUMMANDS + 3) / 4];
 #pragma unroll
         for (int k = 0; !COMPENSATED && k < SUMMANDS; k += 4)
@@ -136,11 +137,11 @@ JFRNN_INLINE static real largest_of(Lanes lanes) {
     }
 }
 
-// Holds some vectors of summands. Only when there are no more, or no room, it is looked up which are the largest, and whose.
+// Holds some vectors of summands. Only when there are no more, or no room, it is looked up who has the largest ones.
 struct Largest {
     enum { HELD = SUMMANDS > 16 ? 8 : 32 };  // vectors: no more than an integer has bits
     number summand_of[HELD][SUMMANDS];
-    Math::i32 source_of[HELD], code_of[HELD];
+    int first_of[HELD];           // what tells the names of a vector
     unsigned int pairs_of[HELD];  // a bit for each lane
     int held;
     Extreme extreme[SUMMANDS];
@@ -150,47 +151,50 @@ struct Largest {
         for (int k = 0; k < SUMMANDS; ++k)
             extreme[k] = Extreme(n);
     }
-    // Takes the summands of pairs; `names` tells their sources and images.
+    // Takes the summands of pairs; `names(first, lane, source, code)` tells the source of a lane, and its image.
     template <class Names>
-    JFRNN_INLINE void add(const number* summand, Math::flag pairs, Names names) {
+    JFRNN_INLINE void add(const number* summand, Math::flag pairs, int first, Names names) {
         if (held == HELD)
-            settle();
-        names(source_of[held], code_of[held]);
+            settle(names);
+        first_of[held] = first;
         pairs_of[held] = bits_of_flags(pairs);
 #pragma unroll
         for (int k = 0; k < SUMMANDS; ++k)
             summand_of[held][k] = Math::select(pairs, summand[k], Math::of(-Bits::not_finite()));
         ++held;
     }
-    JFRNN_APART void settle() {
+    template <class Names>
+    JFRNN_APART void settle(Names names) {
         for (int k = 0; k < SUMMANDS; ++k) {
-            number largest = summand_of[0][k];
-            unsigned int strange = 0;  // lanes where there is NaN
+            number largest = Math::of(-Bits::not_finite());
             for (int v = 0; v < held; ++v) {
                 const number x = summand_of[v][k];
                 largest = x > largest ? x : largest;
-                strange |= bits_of_flags(Math::ne(x, x));
             }
-            const real most = strange ? Bits::no_number() : largest_of(largest);
-            auto theirs = [&](int v) {  // the lanes that hold it
+            const real most = largest_of(largest);
+            unsigned int have = 0, strange = 0;  // vectors that hold it, mostly one, wherever it is; and those that hold NaN
+            for (int v = 0; v < held; ++v) {
                 const number x = summand_of[v][k];
-                return bits_of_flags(strange ? Math::ne(x, x) : Math::eq(x, Math::of(most))) & pairs_of[v];
-            };
-            unsigned int vectors = 0;  // that have any: mostly one, wherever it is
-            for (int v = 0; v < held; ++v)
-                vectors |= (unsigned int)(theirs(v) != 0) << v;
-            for (; vectors; vectors &= vectors - 1) {
+                have |= (unsigned int)((bits_of_flags(Math::eq(x, Math::of(most))) & pairs_of[v]) != 0) << v;
+                strange |= (unsigned int)(bits_of_flags(Math::ne(x, x)) != 0) << v;
+            }
+            for (unsigned int vectors = strange ? strange : have; vectors; vectors &= vectors - 1) {
                 const int v = __builtin_ctz(vectors);
-                for (unsigned int rest = theirs(v); rest; rest &= rest - 1) {
-                    const int lane = __builtin_ctz(rest);
-                    extreme[k].take(most, source_of[v][lane], code_of[v][lane], true);
+                const number x = summand_of[v][k];
+                unsigned int lanes = bits_of_flags(strange ? Math::ne(x, x) : Math::eq(x, Math::of(most))) & pairs_of[v];
+                for (; lanes; lanes &= lanes - 1) {
+                    const int lane = __builtin_ctz(lanes);
+                    int source, code;
+                    names(first_of[v], lane, source, code);
+                    extreme[k].take(strange ? Bits::no_number() : most, source, code, true);
                 }
             }
         }
         held = 0;
     }
-    JFRNN_INLINE void store(Results& results, int id, bool fresh, bool) {
-        settle();
+    template <class Names>
+    JFRNN_INLINE void store(Results& results, int id, bool fresh, bool, Names names) {
+        settle(names);
 #pragma unroll
         for (int k = 0; k < SUMMANDS; ++k) {
             const long long at = (long long)id * SUMMANDS + k;
