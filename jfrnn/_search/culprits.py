@@ -1,6 +1,5 @@
 """Which particles made a search set a status bit, for the messages of errors."""
 
-from collections.abc import Iterator
 from typing import Any
 
 import jax
@@ -26,8 +25,9 @@ def name_culprits(status: Status, inputs: Inputs) -> str:
             found += _first(there & ~finite, lambda at, name=name, x=x: f"{name}[{at}] is {x[at].tolist()}.")
         if Status.OUT_OF_RANGE in status and inputs.box is not None:
             found += _farthest(name, x, there & finite, inputs)
-    if Status.INVALID_CUTOFF in status and isinstance(inputs.cutoff, Radii) and inputs.cutoff.table is None:
-        found += _invalid_cutoffs(inputs.cutoff)
+    if Status.INVALID_CUTOFF in status and isinstance(radii := inputs.cutoff, Radii) and radii.table is None:
+        known: Any = np.asarray(jax.device_get(radii.queries if radii.sources is None else radii.sources))
+        found += _first(~is_radius(known), lambda at: f"cutoff[{at}] is {known[at] / (2 if radii.summed else 1)}.")
     return " ".join(["", *found])
 
 
@@ -53,12 +53,3 @@ def _farthest(name: str, x: Host, there: Host, inputs: Inputs) -> list[str]:
     away = np.where(there[:, None], np.abs(units), 0)
     at, axis = np.unravel_index(int(np.argmax(away)), away.shape)
     return [f"{name}[{at}] lies {units[at, axis]:.6g} lattice vectors away along axis {axis}."]
-
-
-def _invalid_cutoffs(radii: Radii) -> Iterator[str]:
-    for values in (radii.sources, radii.queries):
-        if values is not None:
-            known: Any = np.asarray(jax.device_get(values))
-            half = 2 if radii.summed else 1
-            yield from _first(~is_radius(known), lambda at, known=known, half=half: f"cutoff[{at}] is {known[at] / half}.")
-            return

@@ -13,7 +13,7 @@ from jfrnn._geometry import Box, Status, names_of_bits, shape_of, tell
 from jfrnn._search.edges import Edges, Graph, close_edges, edges_of, edges_of_rows, make_graph, no_edges
 from jfrnn._search.exports import MOST_PAIRS
 from jfrnn._search.kept_search import KeptSearch
-from jfrnn._search.present import Present, Reverse, Topology
+from jfrnn._search.present import Present, Topology, one_each
 from jfrnn._tracing import Points, Real, at_once, own_transfers
 
 _TOTAL_STEP = 16  # steps between powers of two, in which totals are rounded up
@@ -134,7 +134,7 @@ class EdgeList(KeptSearch):
         with own_transfers():
             if 0 in (sources.shape[0], len(rows), self.total):
                 return no_edges(jnp.zeros((len(rows), 1), bool), self.source_count, sources, self.status, self.total)
-            return edges_of(*self._sides(sources, rows, box, decided=not self.skin), self.status)
+            return edges_of(*self._sides(sources, rows, box, decided=not self.skin), self.status, harmless=self._harmless)
 
     def to_jraph(self, positions: Points, box: Box | None = None) -> Graph:
         """Return the edges as a graph of jraph, as `NeighborList.to_jraph` does; jraph need not be installed.
@@ -152,10 +152,6 @@ class EdgeList(KeptSearch):
         return make_graph(self.edges(positions, box=box), self._geometry_inputs(positions, None, box)[0])
 
     @property
-    def _room(self) -> int:
-        return self.total
-
-    @property
     def _row_count(self) -> int:
         return self.offsets.shape[-1] - 1
 
@@ -169,17 +165,10 @@ class EdgeList(KeptSearch):
 
     def _sides(self, sources: Array, rows: Array, box: Box | None, decided: bool = False) -> tuple[Present, Topology]:
         """Return the list at these positions, by its senders, and its receivers; `decided` as in `_present`."""
-        codes = None if self.images is None else self.images.codes
-        by_sender = self._side(self.senders, codes, self.reverse, self.source_count)
-        by_receiver = self._side(self.receivers, None, edges_of_rows(self.offsets, self.total), self._row_count)
+        native = self.problem.options.engine.native
+        by_sender = one_each(self.senders, self.source_count, native, self.reverse)
+        by_receiver = one_each(self.receivers, self._row_count, native, edges_of_rows(self.offsets, self.total))
         return self._present(by_sender, self.offsets[-1], sources, rows, box, decided), by_receiver
-
-    def _side(self, named: Array, codes: Array | None, reverse: Reverse | None, points: int) -> Topology:
-        """Return the particles at one end of the edges, as a list of one slot per edge."""
-        kind = self.problem.options
-        images = 1 if codes is None or kind.images is None else kind.images.total
-        codes = None if codes is None else codes[:, None]
-        return Topology(named[:, None], codes, reverse, None, points, images, False, kind.engine.native)
 
     def _check_single(self) -> None:
         if self.senders.ndim != 1:

@@ -9,10 +9,10 @@ import numpy as np
 from jax import Array, lax
 
 from jfrnn import _geometry as geometry
-from jfrnn._engine import flatten_slots
-from jfrnn._search.exports import flat_pairs, row_offsets
+from jfrnn._engine import add_up, flatten_slots
+from jfrnn._search.exports import flat_pairs
 from jfrnn._search.geometry import edge_shifts, ends_of, lattice_of_rows, norms
-from jfrnn._search.present import Present, Reverse, Topology
+from jfrnn._search.present import Present, Reverse, Topology, one_each
 from jfrnn._search.triplets import Triplets, triplets_of
 from jfrnn._tracing import call_apart, compile_program, on_platform
 
@@ -115,7 +115,7 @@ def flatten(mask: Array, total: int, native: bool = False) -> Flat:
     """Put the set slots of a mask [m, capacity] one after another, in arrays of a static length, by Warp's kernels if `native`."""
     m, capacity = mask.shape
     if native:
-        offsets = row_offsets(jnp.sum(mask, axis=1, dtype=jnp.int32), capacity)
+        offsets = add_up(jnp.sum(mask, axis=1, dtype=jnp.int32))
         on_cpu, on_cuda = (functools.partial(flatten_slots, total=total, cuda=cuda) for cuda in (False, True))
         rows, slots = on_platform(mask, offsets[:-1], cpu=on_cpu, cuda=on_cuda)
         real, edge = lax.iota(jnp.int32, total) < offsets[-1], lax.iota(jnp.int32, total)
@@ -123,7 +123,7 @@ def flatten(mask: Array, total: int, native: bool = False) -> Flat:
         edges = jnp.full(mask.size, total, jnp.int32).at[at].set(edge, mode="drop", unique_indices=True)
         return Flat(jnp.where(real, rows, m), jnp.where(real, slots, 0), offsets, edges)
     ranks = jnp.cumsum(mask, axis=1, dtype=jnp.int32)
-    offsets = row_offsets(ranks[:, -1], capacity)
+    offsets = add_up(ranks[:, -1])
     edges = jnp.where(mask, jnp.minimum(offsets[:-1, None] + ranks - 1, total), total).reshape(-1)
     slots = jnp.zeros(total, jnp.int32).at[edges].set(lax.iota(jnp.int32, mask.size), mode="drop")
     rows = jnp.where(lax.iota(jnp.int32, total) < offsets[-1], slots // capacity, m)
@@ -141,69 +141,27 @@ def flat_pairs_of(idx: Array, mask: Array, sources: int, total: int, native: boo
 
 
 @functools.partial(compile_program, static_argnames="total")
-def flat_edges(present: Present, status: Array, mask: Array, shifts: Array | None, total: int) -> Edges:
-    """Return the edges of a list whose mask [m, capacity] and, in a box, shifts [m, capacity, d], whole floats, are known."""
-    from jfrnn._search.gathers import gather
-
-    topology, sources, rows, near = present.topology, present.sources, present.rows, ends_of(present)
-    (m, capacity), dim = topology.idx.shape, sources.shape[1]
+def flat_edges(present: Present, status: Array, mask: Array, total: int) -> Edges:
+    """Return the edges of a padded list whose mask [m, capacity] is known: those of a flat one."""
+    topology, (m, capacity), (codes, made) = present.topology, present.topology.idx.shape, present.images
     flat = flatten(mask, total, topology.native)
-    real = flat.rows < m
-    if near is not None:
-        sources, rows = near.sources.points, near.rows.points
-    senders = jnp.where(real, topology.idx.reshape(-1)[flat.slots], topology.sources)
+    senders = jnp.where(flat.rows < m, topology.idx.reshape(-1)[flat.slots], topology.sources)
     of_slots = topology.with_reverse()
     by_sender = of_slots._replace(slots=flat.edges.at[of_slots.slots].get(mode="fill", fill_value=total))
-    ends = by_sender, _by_row(flat.offsets, capacity, total, topology.native)
-    sides = [
-        gather(points, Topology(named[:, None], None, end, None, len(points), 1, end.starts is None, topology.native))[:, 0]
-        for points, named, end in zip((sources, rows), (senders, flat.rows), ends, strict=True)
-    ]
-    displacement, shift = sides[0] - sides[1], jnp.zeros((total, dim), jnp.int32)
-    if near is not None and shifts is not None:
-        whole = jnp.where(real[:, None], shifts.reshape(-1, dim)[flat.slots], 0)
-        lattice = _lattice_of_edges(present, flat.rows)
-        displacement = displacement + geometry.translation(whole, lattice)
-        shift = near._replace(of_rows=lattice).shifts_of_given(whole, senders, flat.rows)
-        shift = jnp.where(real[:, None], shift, 0)
-    displacement = jnp.where(real[:, None], displacement, 0).astype(sources.dtype)
-    missing, known = flat.offsets[-1] > total, geometry.are_whole(status)
-    displacement, shift, distance = (geometry.mark_rows(x, known & ~missing) for x in (displacement, shift, norms(displacement)))
-    status = status | jnp.where(missing, jnp.int32(geometry.Status.TOTAL_OVERFLOW.value), 0)
-    return Edges(senders, flat.rows, displacement, shift, real, status, distance, flat.offsets[-1])
+    by_row = _by_row(flat.offsets, capacity, total, topology.native)
+    sides = one_each(senders, topology.sources, topology.native, by_sender), one_each(flat.rows, m, topology.native, by_row)
+    images = None if codes is None else codes._replace(codes=codes.codes.reshape(-1)[flat.slots]), made
+    fixed = dataclasses.replace(present, topology=sides[0], count=flat.offsets[-1], images=images, cutoff=None)
+    return edges_of(fixed, sides[1], status, harmless=geometry.ROWS_ARE_WHOLE)
 
 
-def _lattice_of_edges(present: Present, receivers: Array) -> geometry.Lattice:
-    """Return the lattice of a box, or that of each edge."""
-    if present.box is None or present.kind is None:
-        raise TypeError("a list in open space has no lattice.")
-    systems = None if present.batch is None else present.batch.of_queries.at[receivers].get(mode="clip")
-    return lattice_of_rows(present.box, present.kind, np.dtype(present.sources.dtype), systems, present.topology.native)
-
-
-class _EdgePairs(NamedTuple):
-    """The edges of a flat list at present positions.
-
-    Attributes:
-        vectors: x_j - x_i with the translation of its image, [total, 1, d].
-        mask: Whether an edge is a pair that is closer than the cutoff, [total].
-        whole: Lattice shifts between near points, [total, 1, d] whole floats; None in open space.
-        shift: Lattice shifts between points as they are given, [total, d] int32.
-    """
-
-    vectors: Array
-    mask: Array
-    whole: Array | None
-    shift: Array
-
-
-@compile_program
-def edges_of(present: Present, by_receiver: Topology, status: Array) -> Edges:
-    """Return the edges of a flat list; without a cutoff, all of its pairs are edges."""
+@functools.partial(compile_program, static_argnames="harmless")
+def edges_of(present: Present, by_receiver: Topology, status: Array, harmless: geometry.Status) -> Edges:
+    """Return the edges of a flat list; without a cutoff, all of its pairs are edges. `harmless` bits mean no missing pairs."""
     vectors, mask, _, shift = _edge_pairs(present, by_receiver)
     missing, shift = present.count > len(mask), jnp.where(mask[:, None], shift, 0)
     displacement = jnp.where(mask[:, None], vectors[:, 0], 0).astype(present.sources.dtype)
-    known = geometry.are_whole(status, geometry.Status.NONFINITE) & ~missing
+    known = geometry.are_whole(status, harmless) & ~missing
     displacement, shift, distance = (geometry.mark_rows(x, known) for x in (displacement, shift, norms(displacement)))
     status = status | jnp.where(missing, jnp.int32(geometry.Status.TOTAL_OVERFLOW.value), 0)
     held = present.count if present.cutoff is None else jnp.where(missing, present.count, jnp.sum(mask, dtype=jnp.int32))
@@ -217,7 +175,12 @@ def close_edges(present: Present, by_receiver: Topology) -> tuple[Array, Array |
     return mask, None if whole is None else whole[:, 0]
 
 
-def _edge_pairs(present: Present, by_receiver: Topology) -> _EdgePairs:
+def _edge_pairs(present: Present, by_receiver: Topology) -> tuple[Array, Array, Array | None, Array]:
+    """Return x_j - x_i with the translation of its image, [total, 1, d], and which edges are pairs closer than the cutoff, [total].
+
+    Behind them come lattice shifts between near points, [total, 1, d] whole floats, None in open space; and those between points
+    as they are given, [total, d] int32.
+    """
     from jfrnn._search.gathers import gather
 
     by_sender, sources, rows, near = present.topology, present.sources, present.rows, ends_of(present)
@@ -228,8 +191,9 @@ def _edge_pairs(present: Present, by_receiver: Topology) -> _EdgePairs:
     at_senders, at_receivers = gather(sources, by_sender), gather(rows, by_receiver)
     vectors, pairs, whole = at_senders - at_receivers, None, None
     shift = jnp.zeros((total, sources.shape[1]), jnp.int32)
-    if near is not None:
-        lattice = _lattice_of_edges(present, receivers)
+    if near is not None and present.box is not None and present.kind is not None:
+        systems = None if present.batch is None else present.batch.of_queries.at[receivers].get(mode="clip")
+        lattice = lattice_of_rows(present.box, present.kind, np.dtype(sources.dtype), systems, by_sender.native)
         whole = edge_shifts(vectors, mask, present, receivers, near, lattice)
         if present.forward:  # as in padded lists
             whole = jnp.where((senders == receivers)[:, None, None], geometry.forward_shifts(whole, lattice), whole)
@@ -238,7 +202,7 @@ def _edge_pairs(present: Present, by_receiver: Topology) -> _EdgePairs:
         vectors, shift = pairs.vectors, near._replace(of_rows=lattice).shifts_of_given(whole[:, 0], senders, receivers)
     if present.cutoff is not None:
         mask = mask & _are_close(present, by_receiver, mask, sources, at_receivers, pairs)
-    return _EdgePairs(vectors, mask, whole, shift)
+    return vectors, mask, whole, shift
 
 
 def _are_close(

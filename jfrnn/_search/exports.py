@@ -74,16 +74,11 @@ def pair_total(count: Array, capacity: int) -> Array:
     return lax.reduce(used, jnp.int32(0), saturating_add, (0,))
 
 
-def row_offsets(count: Array, capacity: int) -> Array:
-    """Return the start of each row and the end of the last, [m + 1] int32, saturating at the largest int32."""
-    return add_up(jnp.minimum(count, capacity))
-
-
 @functools.partial(compile_program, static_argnames=("sources", "total"))
 def flat_pairs(idx: Array, count: Array, sources: int, total: int) -> tuple[Array, Array, Array]:
     """Return rows and sources of the pairs, [total] int32 each, padded with m and `sources`, and the row offsets."""
     m, capacity = idx.shape
-    offsets = row_offsets(count, capacity)
+    offsets = add_up(jnp.minimum(count, capacity))
     if 0 in (m, capacity, total):
         return jnp.full(total, m, jnp.int32), jnp.full(total, sources, jnp.int32), offsets
     place = lax.iota(jnp.int32, total)

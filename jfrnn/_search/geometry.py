@@ -9,27 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
+from jfrnn import _geometry as geometry
 from jfrnn._engine import KeptList, kept_mask
-from jfrnn._geometry import (
-    LARGEST_TURN,
-    Batch,
-    Box,
-    Images,
-    Lattice,
-    Near,
-    bring_near,
-    forward_shifts,
-    given_shifts,
-    is_pair_of,
-    make_lattice,
-    nearest_shifts,
-    rounded_product,
-    rounded_scaled,
-    shift_pairs,
-    turns_between,
-    unpack_turns,
-)
-from jfrnn._search.present import ImagesMade, Present, Topology
+from jfrnn._search.present import ImagesMade, Present, one_each
 from jfrnn._tracing import call_apart, compile_program, own_transfers
 
 
@@ -38,23 +20,26 @@ def _of_rows(vectors: Array, systems: Array, native: bool) -> Array:
     from jfrnn._search.gathers import gather
 
     boxes, nearest = len(vectors), jnp.clip(systems, 0, len(vectors) - 1)
-    topology = Topology(nearest[:, None], None, None, None, boxes, 1, False, native)
-    return gather(vectors.reshape(boxes, -1), topology).reshape(-1, *vectors.shape[1:])
+    return gather(vectors.reshape(boxes, -1), one_each(nearest, boxes, native)).reshape(-1, *vectors.shape[1:])
 
 
-def lattice_of_rows(box: Box, kind: Images, dtype: np.dtype, systems: Array | None, native: bool) -> Lattice:
+def lattice_of_rows(
+    box: geometry.Box, kind: geometry.Images, dtype: np.dtype, systems: Array | None, native: bool
+) -> geometry.Lattice:
     """Return the lattice of a box or, where each system has one, that of each row; differentiable by gathers.
 
     `systems` [rows] are those of the rows, of which some may have no box: these get any.
     """
-    lattice = make_lattice(box, kind, dtype)
+    lattice = geometry.make_lattice(box, kind, dtype)
     if not kind.per_system or systems is None:
         return lattice
     fixed = lax.stop_gradient(lattice).of_rows(jnp.clip(systems, 0, len(lattice.origin) - 1))
     return dataclasses.replace(fixed, matrix=_of_rows(lattice.matrix, systems, native))
 
 
-def real_points(sources: Array, queries: Array | None, box: Box, batch: Batch | None, native: bool) -> tuple[Array, Array | None]:
+def real_points(
+    sources: Array, queries: Array | None, box: geometry.Box, batch: geometry.Batch | None, native: bool
+) -> tuple[Array, Array | None]:
     """Return sources and queries as lengths, of coordinates that count the vectors of a box: coordinates @ vectors.
 
     Each component is computed in twice the precision and rounded once, the same on every device; all that follows, such as the
@@ -67,13 +52,19 @@ def real_points(sources: Array, queries: Array | None, box: Box, batch: Batch | 
 
 @functools.partial(compile_program, static_argnames=("orthogonal", "per_system", "native"))
 def _multiply(
-    sources: Array, queries: Array | None, vectors: Array, batch: Batch | None, orthogonal: bool, per_system: bool, native: bool
+    sources: Array,
+    queries: Array | None,
+    vectors: Array,
+    batch: geometry.Batch | None,
+    orthogonal: bool,
+    per_system: bool,
+    native: bool,
 ) -> tuple[Array, Array | None]:
     vectors = jnp.asarray(vectors).astype(sources.dtype)
 
     def real(points: Array, systems: Array | None) -> Array:
         rows = _of_rows(vectors, systems, native) if per_system and systems is not None else vectors
-        return rounded_scaled(points, rows) if orthogonal else rounded_product(points, rows)
+        return geometry.rounded_scaled(points, rows) if orthogonal else geometry.rounded_product(points, rows)
 
     of_sources, of_queries = (None, None) if batch is None else (batch.sources, batch.of_queries)
     return real(sources, of_sources), None if queries is None else real(queries, of_queries)
@@ -82,10 +73,10 @@ def _multiply(
 class Ends(NamedTuple):
     """Sources and rows near the box, and the lattice of each; or of all of them."""
 
-    sources: Near
-    rows: Near
-    of_sources: Lattice
-    of_rows: Lattice
+    sources: geometry.Near
+    rows: geometry.Near
+    of_sources: geometry.Lattice
+    of_rows: geometry.Lattice
 
     def shifts_of_given(self, whole: Array, senders: Array, receivers: Array) -> Array:
         """Return shifts [..., d], whole floats between near points, as whole numbers between points as they are given, int32.
@@ -94,16 +85,18 @@ class Ends(NamedTuple):
         """
         turns = (x.turns.astype(jnp.int32) for x in (self.rows, self.sources))
         of_rows, of_sources = (x.at[named].get(mode="clip") for x, named in zip(turns, (receivers, senders), strict=True))
-        return given_shifts(whole, self.of_rows) + of_rows - of_sources
+        return geometry.given_shifts(whole, self.of_rows) + of_rows - of_sources
 
 
-def find_ends(sources: Array, rows: Array, box: Box, kind: Images, batch: Batch | None, native: bool) -> Ends:
+def find_ends(
+    sources: Array, rows: Array, box: geometry.Box, kind: geometry.Images, batch: geometry.Batch | None, native: bool
+) -> Ends:
     """Return sources and rows near the box, or each near the box of its system; differentiable in points and box."""
     of_rows, of_sources = (None, None) if batch is None else (batch.of_queries, batch.sources)
     lattice = lattice_of_rows(box, kind, np.dtype(sources.dtype), of_rows, native)
     also = lattice if of_rows is of_sources else lattice_of_rows(box, kind, np.dtype(sources.dtype), of_sources, native)
-    near = bring_near(sources, also)
-    return Ends(near, near if rows is sources else bring_near(rows, lattice), also, lattice)
+    near = geometry.bring_near(sources, also)
+    return Ends(near, near if rows is sources else geometry.bring_near(rows, lattice), also, lattice)
 
 
 def ends_of(present: Present) -> Ends | None:
@@ -134,29 +127,26 @@ def _find_slots(present: Present, ends: Ends | None) -> _Slots:
         return _Slots(used, neighbor, difference, None)
     lattice, codes = ends.of_rows, present.images[0]
     if codes is None:
-        shifts = nearest_shifts(difference, lattice)
+        shifts = geometry.nearest_shifts(difference, lattice)
     else:
         turns, query_turns = _turns_now(present.images, ends)
-        image = jnp.where(used, codes.codes.astype(jnp.int32), lattice.images.home)
-        shifts = jnp.asarray(lattice.images.shifts).astype(sources.dtype)[image] + query_turns[:, None] - turns[neighbor]
+        shifts = _shifts_of_codes(codes.codes, used, lattice.images, query_turns[:, None], turns[neighbor])
     if present.forward:  # in the given vectors
         own = neighbor == lax.broadcasted_iota(jnp.int32, idx.shape, 0)
-        shifts = jnp.where(own[..., None], forward_shifts(shifts, lattice), shifts)
-    most = 2 * LARGEST_TURN + max(lattice.images.reach)  # at larger distances no pair is decided exactly
+        shifts = jnp.where(own[..., None], geometry.forward_shifts(shifts, lattice), shifts)
+    most = 2 * geometry.LARGEST_TURN + max(lattice.images.reach)  # at larger distances no pair is decided exactly
     used = used & (jnp.abs(shifts) <= most).all(axis=-1)
     return _Slots(used, neighbor, difference, jnp.where(used[..., None], shifts, 0))
 
 
-def edge_shifts(difference: Array, real: Array, present: Present, receivers: Array, ends: Ends, lattice: Lattice) -> Array:
+def edge_shifts(difference: Array, real: Array, present: Present, receivers: Array, ends: Ends, lattice: geometry.Lattice) -> Array:
     """Return the lattice shifts [total, 1, d], whole floats, of edges between near points; `lattice` is that of all, or of each."""
     codes = present.images[0]
     if codes is None:
-        return nearest_shifts(difference, lattice)
+        return geometry.nearest_shifts(difference, lattice)
     senders, receivers = (jnp.where(real, named, 0) for named in (present.topology.idx[:, 0], receivers))
     turns, query_turns = _turns_now(present.images, ends)
-    image = jnp.where(real, codes.codes.astype(jnp.int32), lattice.images.home)
-    table = jnp.asarray(lattice.images.shifts).astype(difference.dtype)
-    return (table[image] + query_turns[receivers] - turns[senders])[:, None]
+    return _shifts_of_codes(codes.codes, real, lattice.images, query_turns[receivers], turns[senders])[:, None]
 
 
 @compile_program
@@ -185,7 +175,7 @@ def vectors_of(present: Present, as_given: bool = False) -> tuple[Array, Array, 
     ends = ends_of(present)
     slots = _find_slots(present, ends)
     shifts = slots.shifts
-    pairs = None if ends is None or shifts is None else shift_pairs(slots.difference, shifts, ends.of_rows)
+    pairs = None if ends is None or shifts is None else geometry.shift_pairs(slots.difference, shifts, ends.of_rows)
     vectors = slots.difference if pairs is None else pairs.vectors
     if present.native:
         mask = call_apart(kept_mask, kept_list(present))
@@ -193,7 +183,7 @@ def vectors_of(present: Present, as_given: bool = False) -> tuple[Array, Array, 
         rows, sources = (present.rows, present.sources) if ends is None else (ends.rows.points, ends.sources.points)
         fixed = None if pairs is None else pairs._replace(vectors=lax.stop_gradient(pairs.vectors))
         points = lax.stop_gradient((rows, sources))
-        mask = call_apart(is_pair_of, *points, slots.neighbor, slots.used, present.cutoffs, fixed)
+        mask = call_apart(geometry.is_pair_of, *points, slots.neighbor, slots.used, present.cutoffs, fixed)
     if as_given and ends is not None and shifts is not None:
         shifts = _given_shifts(slots, shifts, ends)
     return jnp.where(mask[..., None], vectors, 0), mask, shifts
@@ -205,12 +195,12 @@ def kept_list(present: Present) -> KeptList:
     sources, rows = lax.stop_gradient((present.sources, present.rows))
     systems, turns, lattice = None, None, None
     if box is not None and kind is not None:
-        lattice = of_sources = of_rows = make_lattice(box, kind, np.dtype(sources.dtype))
+        lattice = of_sources = of_rows = geometry.make_lattice(box, kind, np.dtype(sources.dtype))
         if batch is not None and kind.per_system:
             most = len(lattice.origin) - 1  # rows without a box get any
             systems = jnp.clip(batch.sources, 0, most), jnp.clip(batch.of_queries, 0, most)
             of_sources, of_rows = map(lattice.of_rows, systems)
-        ends = Ends(bring_near(sources, of_sources), bring_near(rows, of_rows), of_sources, of_rows)
+        ends = Ends(geometry.bring_near(sources, of_sources), geometry.bring_near(rows, of_rows), of_sources, of_rows)
         sources, rows = ends.sources.points, ends.rows.points
         turns = None if present.images[0] is None else _turns_now(present.images, ends)
     fixed = lax.stop_gradient((sources, rows, turns, present.cutoffs, lattice))
@@ -225,12 +215,16 @@ def kept_shifts(given: KeptList) -> Array:
     used = given.idx < given.sources.shape[0]
     neighbor = jnp.where(used, given.idx, 0)
     if given.codes is None or given.turns is None:
-        shifts = nearest_shifts(given.sources[neighbor] - given.rows[:, None, :], lattice)
+        shifts = geometry.nearest_shifts(given.sources[neighbor] - given.rows[:, None, :], lattice)
     else:
-        image = jnp.where(used, given.codes.astype(jnp.int32), lattice.images.home)
-        table = jnp.asarray(lattice.images.shifts).astype(given.sources.dtype)
-        shifts = table[image] + given.turns[1][:, None] - given.turns[0][neighbor]
+        shifts = _shifts_of_codes(given.codes, used, lattice.images, given.turns[1][:, None], given.turns[0][neighbor])
     return jnp.where(used[..., None], shifts, 0)
+
+
+def _shifts_of_codes(codes: Array, used: Array, images: geometry.Images, of_rows: Array, of_sources: Array) -> Array:
+    """Return the lattice shifts of slots that are used, by their image codes and the turns of both ends."""
+    image = jnp.where(used, codes.astype(jnp.int32), images.home)
+    return jnp.asarray(images.shifts).astype(of_rows.dtype)[image] + of_rows - of_sources
 
 
 def _turns_now(images: ImagesMade, ends: Ends) -> tuple[Array, Array]:
@@ -244,10 +238,10 @@ def _turns_now(images: ImagesMade, ends: Ends) -> tuple[Array, Array]:
     if codes is None:
         raise TypeError("pairs of this list have one image.")
     both = [codes.turns] if codes.query_turns is None else [codes.turns, codes.query_turns]
-    turns = [unpack_turns(x, lattice.dim).astype(sources.dtype) for x in both]
+    turns = [geometry.unpack_turns(x, lattice.dim).astype(sources.dtype) for x in both]
     if made is not None:
         since = zip(turns, made, (sources, rows), (ends.of_sources, lattice), strict=False)
-        turns = [x if before is None else x + turns_between(before, now, each) for x, before, now, each in since]
+        turns = [x if before is None else x + geometry.turns_between(before, now, each) for x, before, now, each in since]
     return turns[0], turns[-1]
 
 

@@ -59,7 +59,7 @@ class KeptSearch(KeptOptions):
     @property
     def _room(self) -> int:
         """How much room there is for pairs; static."""
-        raise NotImplementedError
+        return getattr(self, self._room_name)
 
     @property
     def _row_count(self) -> int:

@@ -87,15 +87,11 @@ def _pull(slopes: Array, lines: _Lines) -> Array:
 
 
 def _pull_by_kernel(slopes: Array, lines: _Lines) -> Array:
-    def on_cpu(slopes: Array, lines: _Lines) -> Array:
-        kept, _, distances = lines
-        return kept_slopes(kept, None, distances, slopes)
-
-    def on_cuda(slopes: Array, lines: _Lines) -> Array:
+    def on(cuda: bool, slopes: Array, lines: _Lines) -> Array:
         kept, topology, distances = lines
-        return kept_slopes(kept, topology.with_reverse().slots, distances, slopes)
+        return kept_slopes(kept, topology.with_reverse().slots if cuda else None, distances, slopes)
 
-    return on_platform(slopes, lines, cpu=on_cpu, cuda=on_cuda)
+    return on_platform(slopes, lines, cpu=functools.partial(on, False), cuda=functools.partial(on, True))
 
 
 _along_p, _pull_p = Primitive("jfrnn_along"), Primitive("jfrnn_pull")

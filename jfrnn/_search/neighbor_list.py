@@ -116,7 +116,7 @@ class NeighborList(KeptSearch):
 
         Differentiable: to any order in positions, queries and box; the mask is a constant. Jit: yes. vmap: yes.
         """
-        vectors, mask, _ = self._geometry(positions, queries, box)
+        vectors, mask, _ = self._geometry_of(*self._geometry_inputs(positions, queries, box), as_given=True)
         with own_transfers():
             return self._mark(vectors), mask
 
@@ -215,15 +215,22 @@ class NeighborList(KeptSearch):
             raise ValueError(
                 f"edges() numbers slots by int32, and this list has {self.idx.size}: take `vectors`, or fewer queries."
             )
-        total = self._count_pairs("edges") if total is None else check_total(total)
+        if total is None:
+            if isinstance(self.count, Tracer):
+                raise TypeError(
+                    "edges() makes arrays of a static length inside jax.jit: write edges(positions, total), total being it."
+                )
+            self._check_known()
+            total = self._pairs_held()
+        total = check_total(total)
         self._check_single()
         sources, rows, box = self._geometry_inputs(positions, queries, box)
-        _, mask, shifts = self._geometry_of(*lax.stop_gradient((sources, rows, box)))
+        mask = self._geometry_of(*lax.stop_gradient((sources, rows, box)))[1]
         with own_transfers():
             if 0 in (sources.shape[0], *self.idx.shape, total):
                 made = no_edges(mask, self.source_count, sources, self.status, total)
             else:
-                made = flat_edges(self._at(sources, rows, box), self.status, mask, shifts, total)
+                made = flat_edges(self._at(sources, rows, box), self.status, mask, total)
         check_held(made.pair_count, total)
         return made
 
@@ -330,10 +337,6 @@ class NeighborList(KeptSearch):
         return DenseNeighbors(self.idx, self.status)
 
     @property
-    def _room(self) -> int:
-        return self.capacity
-
-    @property
     def _row_count(self) -> int:
         return self.idx.shape[0]
 
@@ -357,9 +360,6 @@ class NeighborList(KeptSearch):
         verlet = dataclasses.replace(verlet, positions=new.reference, box=new.box, rebuild_count=new.rebuild_count)
         found = {"idx": new.idx, "count": new.counts, "status": new.status, "required": new.required, "order": new.order}
         return dataclasses.replace(self, **found, verlet=verlet)
-
-    def _geometry(self, positions: Points, queries: Points | None, box: Box | None) -> tuple[Array, Array, Array | None]:
-        return self._geometry_of(*self._geometry_inputs(positions, queries, box), as_given=True)
 
     def _geometry_of(
         self, sources: Array, rows: Array, box: Box | None, as_given: bool = False
@@ -388,7 +388,6 @@ class NeighborList(KeptSearch):
         total, near = check_total(total), self._near_now(name, at)
         self._check_single()
         if near is None:
-            self._check_known()
             if not isinstance(self.count, Tracer):
                 with at_once():
                     check_held(pair_total(self.count, self.capacity), total)
@@ -398,28 +397,17 @@ class NeighborList(KeptSearch):
         check_held(held, total)
         return made[0], made[1], made[2]
 
-    def _count_pairs(self, name: str) -> int:
-        """Return how many pairs the list holds, those of the skin included.
-
-        Raises:
-            TypeError: The list is traced.
-        """
-        if isinstance(self.count, Tracer):
-            raise TypeError(
-                f"{name}() makes arrays of a static length inside jax.jit: write {name}(positions, total), total being it."
-            )
-        self._check_known()
-        return int(np.asarray(self.count).sum(dtype=np.int64))
-
     def _near_now(self, name: str, at: Now) -> Array | None:
+        """Return which slots hold a pair now; without positions None, of a list that lacks no pairs as far as is known."""
         for unknown in set(at) - set(Now.__annotations__):
             raise TypeError(f"NeighborList.{name}() got an unexpected keyword argument {unknown!r}")
         if "positions" in at:
-            return self._geometry(at["positions"], at.get("queries"), at.get("box"))[1]
+            return self.vectors(at["positions"], at.get("box"), queries=at.get("queries"))[1]
         if at:
             raise TypeError(
                 f"{', '.join(at)} tell where pairs are now, with positions: pass positions=, or leave {next(iter(at))} out."
             )
+        self._check_known()
         return None
 
     def _check_rows(self, name: str, at: Now) -> tuple[np.ndarray, np.ndarray]:
@@ -429,8 +417,6 @@ class NeighborList(KeptSearch):
                 "static length of its arrays."
             )
         near = self._near_now(name, at)
-        if near is None:
-            self._check_known()
         self._check_single()
         with own_transfers():
             idx, count = np.asarray(self.idx), np.asarray(self.count)

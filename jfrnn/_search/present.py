@@ -134,6 +134,12 @@ class Topology:
         return dataclasses.replace(self, idx=idx, codes=codes, reverse=reverse, order=None, sources=size * n)
 
 
+def one_each(named: Array, sources: int, native: bool, reverse: Reverse | None = None) -> Topology:
+    """Return the list whose rows have one slot, which holds the source that is named [m]."""
+    mutual = reverse is not None and reverse.starts is None
+    return Topology(named[:, None], None, reverse, None, sources, 1, mutual, native)
+
+
 def make_topology(
     options: Options,
     sources: int,

@@ -15,7 +15,7 @@ from jfrnn import _engine as engine
 from jfrnn import _geometry as geometry
 from jfrnn._search.culprits import name_culprits
 from jfrnn._search.geometry import real_points
-from jfrnn._search.present import ImageCodes, Topology, make_topology
+from jfrnn._search.present import ImageCodes, make_topology, one_each
 from jfrnn._search.verlet import first_verlet
 from jfrnn._tracing import Given, Real, at_once, compile_program, own_transfers
 
@@ -56,11 +56,6 @@ class Problem:
     source_count: int
     dim: int
     dtype: np.dtype
-
-    @property
-    def include_self(self) -> bool:
-        """Whether each particle is its own neighbor."""
-        return not self.own_queries and not self.options.filter.drop_self
 
     def reach(self, radii: geometry.Radii | None) -> float | None:
         """Return the largest distance of listed pairs, skin included; None if it is not known while tracing."""
@@ -121,7 +116,7 @@ class KeptOptions:
     @property
     def include_self(self) -> bool:
         """Whether each particle is its own neighbor."""
-        return self.problem.include_self
+        return not self.own_queries and not self.problem.options.filter.drop_self
 
     @property
     def closed(self) -> bool:
@@ -271,7 +266,7 @@ def find_fields(
         sources = engine.hide_inactive(inputs.sources, engine.take_present(inputs).active)
         verlet = first_verlet(sources, inputs.queries, inputs.box, options.images, radii, inputs.batch)
     if reversing and rows.idx is not None and flat:
-        reverse = Topology(rows.idx[:, None], None, None, None, n, 1, False, options.engine.native).with_reverse()
+        reverse = one_each(rows.idx, n, options.engine.native).with_reverse()
     elif reversing and rows.idx is not None:
         codes = None if images is None else images.codes
         topology = make_topology(options, n, inputs.queries is not None, radii, rows.idx, codes, None, rows.order)
