@@ -11,6 +11,7 @@ float. Its cell, floor(x·2^k) in exact arithmetic, is therefore in the box of c
 only if a direction separates it, widened by r', from the triangle by more than any rounding error.
 """
 
+import functools
 from itertools import product
 from typing import NamedTuple
 
@@ -19,7 +20,7 @@ import numpy as np
 from jax import Array, lax
 
 from jfrnn._geometry import Cutoff
-from jfrnn._triangles.exact import Vector, cross, dot, minus
+from jfrnn._triangles.exact import Vector, cross, dot, minus, sum_of
 
 MOST_CELLS = {2: 8, 3: 16}  # most cells per triangle, by dimension
 LANES = {2: 32, 3: 128}  # most cells of a box that are tested one by one; a larger box uses larger cells
@@ -201,14 +202,10 @@ def _directions(corners: list[Vector], zero: Array) -> list[Vector]:
 
 def _separates(direction: Vector, x: list[Vector], reach: Array) -> Array:
     eps, size = jnp.finfo(reach.dtype).eps, [jnp.abs(component) for component in direction]
-    whole = size[0]
-    for component in size[1:]:
-        whole = whole + component
+    whole = sum_of(size)
     heights = [dot(direction, corner) for corner in x]
     doubt = [dot(size, [jnp.abs(component) for component in corner]) for corner in x]
-    least, most, largest = heights[0], heights[0], doubt[0]
-    for height, error in zip(heights[1:], doubt[1:], strict=True):
-        least, most, largest = jnp.minimum(least, height), jnp.maximum(most, height), jnp.maximum(largest, error)
+    least, (most, largest) = functools.reduce(jnp.minimum, heights), (functools.reduce(jnp.maximum, x) for x in (heights, doubt))
     room = (0.5 * whole + reach * jnp.sqrt(dot(direction, direction))) * (1 + 8 * eps) + 8 * eps * largest
     sound = (whole > 2.0**-60) & (room < jnp.finfo(reach.dtype).max)  # squares neither underflow nor overflow
     return sound & ((least > room) | (most < -room))

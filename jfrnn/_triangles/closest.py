@@ -3,13 +3,14 @@
 Contacts are, among the triangles near a particle, one per wall; others only continue it across a side or corner.
 """
 
+import functools
 from typing import NamedTuple
 
 import jax.numpy as jnp
 from jax import Array, lax
 
 from jfrnn._tracing import set_places
-from jfrnn._triangles.exact import Vector, cross, dot, minus
+from jfrnn._triangles.exact import Vector, cross, dot, minus, nearer_of
 
 # The feature on which the nearest point lies: corners 0, 1, 2; sides _SIDE + 0, 1, 2, from that corner to the next; _FACE.
 _SIDE, _FACE = 3, 6
@@ -42,7 +43,7 @@ def nearest_of(points: Array, corners: Array) -> Nearest:
     unit = jnp.where(largest > 0, largest, 1)  # lengths around 1, whose squares stay within the float range
     dim = points.shape[-1]
     x = [[raw[..., c, k] / unit for k in range(dim)] for c in range(dim)]
-    best, foot, feature = None, [], jnp.zeros(unit.shape, jnp.int32)
+    found: list[tuple[Array, Vector, Array]] = []
     for i in range(3 if dim == 3 else 1):
         j = (i + 1) % dim
         along = minus(x[j], x[i])
@@ -51,25 +52,15 @@ def nearest_of(points: Array, corners: Array) -> Nearest:
         here = [a + place * b for a, b in zip(x[i], along, strict=True)]
         here = [jnp.where(place < 1, h, b) for h, b in zip(here, x[j], strict=True)]
         what = jnp.where(place <= 0, i, jnp.where(place >= 1, j, _SIDE + i))
-        best, foot, feature = _nearer(best, foot, feature, dot(here, here), here, what)
+        found.append((dot(here, here), here, what.astype(jnp.int32)))
     if dim == 3:
-        on_face, square = _foot_on_face(x)
-        best, foot, feature = _nearer(best, foot, feature, square, on_face, jnp.full_like(feature, _FACE))
+        found.append((*_foot_on_face(x), jnp.full(unit.shape, _FACE, jnp.int32)))
+    _, foot, feature = functools.reduce(nearer_of, found)
     return Nearest(jnp.stack(foot, axis=-1) * unit[..., None], feature)
 
 
-def _nearer(
-    best: Array | None, foot: Vector, feature: Array, square: Array, here: Vector, what: Array
-) -> tuple[Array, Vector, Array]:
-    if best is None:
-        return square, here, what.astype(jnp.int32)
-    nearer = square < best
-    foot = [jnp.where(nearer, new, old) for new, old in zip(here, foot, strict=True)]
-    return jnp.where(nearer, square, best), foot, jnp.where(nearer, what, feature).astype(jnp.int32)
-
-
-def _foot_on_face(x: list[Vector]) -> tuple[Vector, Array]:
-    """Return the foot of the origin on a triangle, and its squared distance, which is infinite if the foot lies outside.
+def _foot_on_face(x: list[Vector]) -> tuple[Array, Vector]:
+    """Return the squared distance of the foot of the origin on a triangle, infinite if the foot lies outside, and the foot.
 
     The plane is spanned by one side and the height on it, orthogonalized twice. So all results are exact for a triangle whose
     corners are a few roundings from the given ones, however thin; one as thin as a rounding error is left to its sides.
@@ -91,7 +82,7 @@ def _foot_on_face(x: list[Vector]) -> tuple[Vector, Array]:
     area = jnp.where(inside, dot(normal, normal), 1)
     along_normal = jnp.where(inside, dot(x[0], normal) / area, 0)
     foot = [along_normal * n for n in normal]
-    return foot, jnp.where(inside, dot(foot, foot), jnp.inf)
+    return jnp.where(inside, dot(foot, foot), jnp.inf), foot
 
 
 class Rows(NamedTuple):

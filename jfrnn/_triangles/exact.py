@@ -15,19 +15,22 @@ uses the same floats. A compiler may, however, compute them once per use, and fu
 another; `steady` prevents that.
 """
 
+import functools
+import operator
 from collections.abc import Callable
 from typing import TypeVar
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
 from jfrnn._geometry import Cutoff, limb_bits
 from jfrnn._tracing import first_set, set_places
-from jfrnn._triangles.integers import Segments, Shapes, bit_range, is_near, limb_counts
+from jfrnn._triangles.integers import Segments, Shapes, bit_range, limb_counts
 
-ShapesAt = Callable[[Array], Shapes]
 Asked = TypeVar("Asked", Shapes, Segments)
+Found = TypeVar("Found", bound=tuple)
 Vector = list[Array]
 
 _USUAL, _WIDE = 2, 3  # open pairs: undecided yet, and too wide for the usual number of limbs
@@ -35,17 +38,11 @@ _USUAL_CHUNK = 256  # pairs per iteration
 _WIDE_CHUNK = 8
 
 
-def is_near_of(points: Vector, corners: list[Vector], cutoff: Cutoff, shapes_at: ShapesAt, asked: Array, zero: Array) -> Array:
-    """Decide [q] pairs of points and shapes, given axis by axis; False where not `asked`.
-
-    `shapes_at` returns the pairs at indices [k]; `zero` [q] is that of `steady`.
-    """
-    surely, open_pairs = sure_pairs(points, corners, cutoff, zero)
-    return (surely & asked) | refine(open_pairs & asked, shapes_at, is_near)
-
-
 def sure_pairs(points: Vector, corners: list[Vector], cutoff: Cutoff, zero: Array) -> tuple[Array, Array]:
-    """Return which pairs are certainly near, and which are left open: [q] bool each."""
+    """Return which pairs of points and shapes, given axis by axis, are certainly near, and which are left open: [q] bool each.
+
+    `zero` [q] is that of `steady`.
+    """
     scale = cutoff.unit_scale if cutoff.scaled else 1
     x = [[(v - p) * scale if cutoff.scaled else v - p for v, p in zip(corner, points, strict=True)] for corner in corners]
     radius = jnp.asarray(cutoff.radius * scale)
@@ -67,16 +64,14 @@ def _is_surely_near(x: list[Vector], weights: Vector, radius: Array) -> Array:
 def _is_surely_far(x: list[Vector], unit: Vector, radius: Array) -> Array:
     eps = jnp.finfo(unit[0].dtype).eps
     heights = [dot(unit, corner) - 4 * eps * dot([jnp.abs(c) for c in unit], [jnp.abs(c) for c in corner]) for corner in x]
-    least = heights[0]
-    for height in heights[1:]:
-        least = jnp.minimum(least, height)
+    least = functools.reduce(jnp.minimum, heights)
     return (least > 0) & (least * least > radius * radius * dot(unit, unit) * (1 + 16 * eps))
 
 
 def _nearest(x: list[Vector], zero: Array) -> tuple[Vector, Vector]:
     """Return corner weights of about the nearest point to the origin, and the direction to it."""
     sides = [(0, 1), (1, 2), (2, 0)] if len(x) == 3 else [(0, 1)]
-    best, weights, foot = None, [], []
+    found: list[tuple[Array, Vector, Vector]] = []
     for i, j in sides:
         along = minus(x[j], x[i])
         length = dot(along, along, zero)
@@ -85,14 +80,8 @@ def _nearest(x: list[Vector], zero: Array) -> tuple[Vector, Vector]:
         here = [jnp.zeros_like(place) for _ in x]
         here[i], here[j] = 1 - place, place
         point = _combine(here, x, zero)
-        square = dot(point, point, zero)
-        if best is None:
-            best, weights, foot = square, here, point
-            continue
-        nearer = square < best
-        best = jnp.where(nearer, square, best)
-        weights = [jnp.where(nearer, new, old) for new, old in zip(here, weights, strict=True)]
-        foot = [jnp.where(nearer, new, old) for new, old in zip(point, foot, strict=True)]
+        found.append((dot(point, point, zero), here, point))
+    _, weights, foot = functools.reduce(nearer_of, found)
     if len(x) == 2:
         return weights, foot
     normal = cross(minus(x[1], x[0]), minus(x[2], x[0]), zero)
@@ -104,12 +93,15 @@ def _nearest(x: list[Vector], zero: Array) -> tuple[Vector, Vector]:
     return weights, [jnp.where(inside, toward * n, f) for n, f in zip(normal, foot, strict=True)]
 
 
+def nearer_of(one: Found, other: Found) -> Found:
+    """Return the one of two candidates, pytrees of arrays of one shape, whose first array, a squared distance, is smaller."""
+    nearer = jax.tree.leaves(other)[0] < jax.tree.leaves(one)[0]
+    return jax.tree.map(lambda old, new: jnp.where(nearer, new, old), one, other)
+
+
 def sum_of(parts: Vector) -> Array:
     """Add arrays in the given order."""
-    total = parts[0]
-    for part in parts[1:]:
-        total = total + part
-    return total
+    return functools.reduce(operator.add, parts)
 
 
 def steady(x: Array, zero: Array | None) -> Array:

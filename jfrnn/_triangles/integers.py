@@ -140,7 +140,7 @@ def _near_segment(vectors: Array) -> Array:
     limit = _product(radius, radius)
     square = jnp.stack([sums[0], sums[1]]) - limit
     place, length = -sums[2:3], sums[3:]
-    square, place, length, rest = _split(carry_limbs(jnp.concatenate([square, place, length, length - place])), 2, 1, 1, 1)
+    square, place, length, rest = jnp.split(carry_limbs(jnp.concatenate([square, place, length, length - place])), (2, 3, 4))
     beside = _product(square[:1], length) - _product(place, place)
     return _near_parts(_signs(square), _signs(place), _signs(rest), limb_sign(beside))
 
@@ -232,10 +232,6 @@ def _product(a: Array, b: Array) -> Array:
         return lax.dynamic_update_slice_in_dim(total, window + more, GUARDS + i, axis=-1)
 
     return lax.fori_loop(0, a.shape[-1], add_moved, jnp.zeros((*shape, GUARDS + a.shape[-1] + width), a.dtype))
-
-
-def _split(rows: Array, *sizes: int) -> list[Array]:
-    return jnp.split(rows, np.cumsum(sizes)[:-1])
 
 
 def _signs(rows: Array) -> Array:

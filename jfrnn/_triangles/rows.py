@@ -11,8 +11,8 @@ from jfrnn._geometry import Cutoff
 from jfrnn._search import norms
 from jfrnn._triangles.cells import TriangleCells, bucket_of, cells_of, scale_of
 from jfrnn._triangles.closest import nearest_of
-from jfrnn._triangles.exact import is_near_of, zero_of
-from jfrnn._triangles.integers import Shapes
+from jfrnn._triangles.exact import refine, sure_pairs, zero_of
+from jfrnn._triangles.integers import Shapes, is_near
 
 Decide = Callable[[Array, Array, Array, Array, Cutoff, Array], Array]  # the type of `decide_pairs`
 
@@ -100,7 +100,8 @@ def decide_pairs(own: Array, corners: Array, particle: Array, triangle: Array, c
         radius = lax.optimization_barrier(jnp.asarray(cutoff.radius))
         return Shapes(own[particle[at]].T, jnp.moveaxis(corners[triangle[at]], 0, -1), radius)
 
-    return is_near_of(axes, corner_axes, cutoff, shapes_at, asked, zero_of(triangle, np.dtype(own.dtype)))
+    surely, open_pairs = sure_pairs(axes, corner_axes, cutoff, zero_of(triangle, np.dtype(own.dtype)))
+    return (surely & asked) | refine(open_pairs & asked, shapes_at, is_near)
 
 
 def nearest_slots(

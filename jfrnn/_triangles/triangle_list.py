@@ -196,14 +196,7 @@ class TriangleList:
         Differentiable: to any order in positions and vertices, where the nearest point does not jump; the gradient of a distance of
         0 is 0. Jit: yes. vmap: yes. Source: Ericson (2005), sect. 5.1.
         """
-        points, corners = self._check_points(positions, vertices)
-        self._check_rows()
-        if 0 in (*self.idx.shape, self.faces.shape[0]):
-            none = jnp.zeros(self.idx.shape, points.dtype)
-            return jnp.broadcast_to(points[:, None], (*self.idx.shape, points.shape[1])), none, none > 0
-        vectors, _, mask = _nearest_in_rows(self, points, corners)
-        vectors = self._mark(vectors)
-        return points[:, None] + vectors, norms(vectors), mask
+        return self._nearest_points(positions, vertices, one_per_wall=False)
 
     def contacts(self, positions: Points, vertices: Points | None = None) -> tuple[Array, Array, Array]:
         """Compute the contacts of spheres with walls: the nearest points of `closest`, one per wall instead of one per triangle.
@@ -240,12 +233,17 @@ class TriangleList:
         >>> tri.count, tri.contacts(x)[2].sum()
         (Array([2], dtype=int32), Array(1, dtype=int32))
         """
+        return self._nearest_points(positions, vertices, one_per_wall=True)
+
+    def _nearest_points(self, positions: Points, vertices: Points | None, one_per_wall: bool) -> tuple[Array, Array, Array]:
         points, corners = self._check_points(positions, vertices)
-        if 0 in (*self.idx.shape, self.faces.shape[0]):
-            return self.closest(points, vertices=vertices)
         self._check_rows()
+        if 0 in (*self.idx.shape, self.faces.shape[0]):
+            none = jnp.zeros(self.idx.shape, points.dtype)
+            return jnp.broadcast_to(points[:, None], (*self.idx.shape, points.shape[1])), none, none > 0
         vectors, feature, mask = _nearest_in_rows(self, points, corners)
-        vectors, mask = _contacts_in_rows(self, points, corners, vectors, feature, mask)
+        if one_per_wall:
+            vectors, mask = _contacts_in_rows(self, points, corners, vectors, feature, mask)
         vectors = self._mark(vectors)
         return points[:, None] + vectors, norms(vectors), mask
 
@@ -386,7 +384,14 @@ def _signed_distance(tri: TriangleList, points: Array, vertices: Array) -> Signe
     apart = some & (distance > 0)
     watertight = (is_closed(tri.faces) if tri.closed is None else tri.closed) & jnp.all(good)
     tree = tri.cells if isinstance(tri.cells, TriangleTree) else None
-    inside, unknown = call_apart(functools.partial(_sides, tri._engine), tree, fixed, at, good, apart & watertight, cutoff)
+
+    def sides(tree: TriangleTree | None, corners: Array, points: Array, good: Array, asked: Array) -> tuple[Array, Array]:
+        """Say which of the points asked for are inside, and which of them no ray decides: [n] bool each."""
+        tree = grow_tree(corners, good, cutoff) if tree is None else tree
+        rays, least = ray_ways(points.shape[1], np.dtype(points.dtype)), least_winding(corners, good)
+        return tri._engine.cast(tree, corners, points, rays, asked, least, cutoff)
+
+    inside, unknown = call_apart(sides, tree, fixed, at, good, apart & watertight)
     by_normal = some & (unknown | ~(apart & watertight))
     normal = call_apart(pseudonormals, Rows(tri.idx, used, triangle, feature), tri.faces, fixed, good, by_normal)
     height = jnp.sum(normal * away, axis=1)
@@ -394,18 +399,3 @@ def _signed_distance(tri: TriangleList, points: Array, vertices: Array) -> Signe
     signed = jnp.where(distance > 0, signed, height)
     grows = jnp.where(apart[:, None], away / jnp.where(apart, signed, 1)[:, None], jnp.where(some[:, None], normal, 0))
     return SignedDistance(jnp.where(some, signed, 0), some, grows, watertight)
-
-
-def _sides(
-    engine: TriangleEngine,
-    tree: TriangleTree | None,
-    corners: Array,
-    points: Array,
-    good: Array,
-    asked: Array,
-    cutoff: geometry.Cutoff,
-) -> tuple[Array, Array]:
-    """Say which of the points asked for are inside, and which of them no ray decides: [n] bool each."""
-    tree = grow_tree(corners, good, cutoff) if tree is None else tree
-    rays, least = ray_ways(points.shape[1], np.dtype(points.dtype)), least_winding(corners, good)
-    return engine.cast(tree, corners, points, rays, asked, least, cutoff)

@@ -158,8 +158,7 @@ def cast_rays(
         find = _rays_callable(points.shape[1], bool(points.dtype == jnp.float64), cuda)
         return find(*given, output_dims={"side": len(points), "info": 1})[0]
 
-    on_cpu, on_cuda = (functools.partial(call, cuda) for cuda in (False, True))
-    side = on_platform(*inputs, cpu=on_cpu, cuda=on_cuda)
+    side = on_platform(*inputs, cpu=functools.partial(call, False), cuda=functools.partial(call, True))
     return side == 1, side == 2
 
 

@@ -13,6 +13,8 @@ most 11u of the sum of absolute values; 8 eps is used.
 Source: Ericson (2005), Real-Time Collision Detection, sect. 5.3.4, for the products.
 """
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -162,9 +164,7 @@ def _meets_boxes(boxes: Array, points: Array, rays: Array, cutoff: Cutoff) -> Ar
     inner = jnp.asarray(cutoff.radius) * (1 - 8 * eps)
     low = [(boxes[k] - points[:, k, None]) + (inner - 4 * eps * (jnp.abs(boxes[k]) + inner)) for k in range(dim)]
     high = [(boxes[dim + k] - points[:, k, None]) - (inner - 4 * eps * (jnp.abs(boxes[dim + k]) + inner)) for k in range(dim)]
-    largest = jnp.abs(low[0])
-    for side in (*low, *high):
-        largest = jnp.maximum(largest, jnp.abs(side))
+    largest = functools.reduce(jnp.maximum, map(jnp.abs, (*low, *high)))
     first, last = jnp.zeros_like(largest), jnp.full_like(largest, jnp.inf)
     for k in range(dim):
         one, two = (side / rays[:, k, None] for side in (low[k] - 16 * eps * largest, high[k] + 16 * eps * largest))
@@ -183,9 +183,7 @@ def _crossings(corners: Array, triangle: Array, points: Array, rays: Array) -> t
     ray = [rays[:, k] for k in range(dim)]
     sides, doubts, height, doubt = line_products(x, ray)
     doubts, doubt = [8 * finfo.eps * d + finfo.tiny for d in doubts], 8 * finfo.eps * doubt + finfo.tiny
-    behind = jnp.ones_like(there)
-    for corner in x:
-        behind &= dot(ray, corner) < -_BEHIND * finfo.eps
+    behind = functools.reduce(jnp.logical_and, (dot(ray, corner) < -_BEHIND * finfo.eps for corner in x))
     left, right, leaves, enters = jnp.zeros_like(there), jnp.zeros_like(there), height > doubt, height < -doubt
     sure_left, sure_right = leaves, enters
     for side, error in zip(sides, doubts, strict=True):
