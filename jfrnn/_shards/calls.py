@@ -3,7 +3,7 @@
 import functools
 import math
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -30,6 +30,11 @@ class Asked(NamedTuple):
     include_self: bool
     closed: bool
     backend: Given
+
+    def options(self, particles: Particles, active: Array) -> dict[str, Any]:
+        """Return what the functions for one device are told of the particles that a shard sees, beside the cutoff and the skin."""
+        kind = {"include_self": self.include_self, "closed": self.closed, "backend": self.backend}
+        return kind | {"box": particles.box, "active": active}
 
 
 def check_asked(particles: object, cutoff: Given, skin: object, include_self: object, closed: object, backend: Given) -> Asked:
@@ -112,15 +117,9 @@ def halo(particles: Particles) -> Halo:
     return over_shards(halo_in_shard, particles, halo_spec(particles), lax.stop_gradient(particles))
 
 
-class Seen(NamedTuple):
-    """The particles that a shard sees: its own and those of its halo."""
-
-    positions: Array
-    active: Array
-
-
-def gather_seen(particles: Particles, halo: Halo) -> Seen:
-    return Seen(exchange(particles.positions, halo, particles), halo.ids >= 0)
+def gather_seen(particles: Particles, halo: Halo) -> tuple[Array, Array]:
+    """Return the positions of the particles that a shard sees, its own and those of its halo, and in which rows there are any."""
+    return exchange(particles.positions, halo, particles), halo.ids >= 0
 
 
 def take_halo(particles: Particles, halo: Halo | None) -> tuple[Halo, Array]:
@@ -139,9 +138,7 @@ def counts(particles: Particles, halo: Halo | None, asked: Asked) -> Array:
         halo, good = take_halo(particles, halo)
         x, active = gather_seen(particles, halo)
         radius = list_radius(asked.cutoff, asked.skin, np.dtype(x.dtype))
-        counts = count(
-            x, radius, box=particles.box, include_self=asked.include_self, closed=asked.closed, active=active, backend=asked.backend
-        )
+        counts = count(x, radius, **asked.options(particles, active))
         return mark_rows(counts[: particles.sizes.particles], good)
 
     return over_shards(count_shard, particles, of_shards(particles.mesh), lax.stop_gradient(particles), halo)

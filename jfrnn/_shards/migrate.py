@@ -10,6 +10,7 @@ import numpy as np
 from jax import Array, lax
 
 from jfrnn._geometry import Status, ordered_bits
+from jfrnn._shards.calls import over_shards
 from jfrnn._shards.halo import halo_in_shard
 from jfrnn._shards.particles import Particles, spec_of
 from jfrnn._tracing import Tree, set_places
@@ -36,9 +37,7 @@ def migrate(particles: Particles) -> Particles:
     gradient flows through. Jit: yes. vmap: no. Source: bounds by counting (Warren & Salmon 1993, doi:10.1145/169627.169640), found
     digit by digit.
     """
-    particles = lax.stop_gradient(particles)
-    spec = spec_of(particles)
-    return jax.shard_map(_migrate_shard, mesh=particles.mesh, in_specs=(spec,), out_specs=spec, check_vma=False)(particles)
+    return over_shards(_migrate_shard, particles, spec_of(particles), lax.stop_gradient(particles))
 
 
 def _migrate_shard(particles: Particles) -> Particles:
@@ -50,19 +49,18 @@ def _migrate_shard(particles: Particles) -> Particles:
     fullest = jnp.max(lax.psum(_counts(jnp.where(there, wanted, shards), shards), mesh.axis_names))
     fits = fullest <= room
     goes = jnp.where(there, jnp.where(fits, wanted, here), shards)
-    rows = _move((x, particles.ids, particles.values), goes, particles)
-    positions, ids, values = jax.tree.map(lambda leaf: _where_used(rows[1], leaf), rows)
+    positions, ids, values = _move((x, particles.ids, particles.values), goes, particles)
+
+    def where_used(leaf: Array) -> Array:
+        return jnp.where((ids >= 0).reshape(-1, *[1] * (leaf.ndim - 1)), leaf, jnp.zeros((), leaf.dtype))
+
+    positions, values = jax.tree.map(where_used, (positions, values))
     status = particles.status | jnp.where(fits, 0, Status.SHARD_OVERFLOW.value)
     bounds = tuple(jnp.where(fits, new, old) for new, old in zip(bounds, particles.bounds, strict=True))
     moved = dataclasses.replace(particles, positions=positions, ids=ids, values=values, bounds=bounds)
     halo = halo_in_shard(moved)
     required = particles.required.join(halo.required._replace(particles=fullest))
     return dataclasses.replace(moved, status=status | halo.status, required=required)
-
-
-def _where_used(ids: Array, leaf: Array) -> Array:
-    """Return rows with 0 in unused ones; ids get -1 there."""
-    return leaf if leaf is ids else jnp.where((ids >= 0).reshape(-1, *[1] * (leaf.ndim - 1)), leaf, jnp.zeros((), leaf.dtype))
 
 
 def _counts(goes: Array, shards: int) -> Array:

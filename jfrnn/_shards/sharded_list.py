@@ -167,17 +167,7 @@ def list_on_shards(particles: Particles, asked: Asked, capacity: int) -> Neighbo
     def of_shard(particles: Particles) -> tuple[Any, ...]:
         halo = halo_in_shard(particles)
         x, active = gather_seen(particles, halo)
-        made = search(
-            x,
-            asked.cutoff,
-            box=particles.box,
-            include_self=asked.include_self,
-            closed=asked.closed,
-            skin=asked.skin,
-            active=active,
-            capacity=capacity,
-            backend=asked.backend,
-        )
+        made = search(x, asked.cutoff, skin=asked.skin, capacity=capacity, **asked.options(particles, active))
         status = share_bits(made.status | halo.status, mesh)
         required = halo.required._replace(row=share_largest(made.required, mesh))
         return jax.tree.map(lambda leaf: leaf[None], made), halo, made.count[: particles.sizes.particles], status, required

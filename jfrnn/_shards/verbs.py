@@ -191,9 +191,7 @@ def _sums(
         theirs = jax.tree.map(lambda leaf: exchange(leaf, halo, particles), values)
         options: dict[str, Any] = {"reduce": reduce, "compensated": compensated}
         if local is None:
-            options |= {"box": particles.box, "include_self": asked.include_self, "closed": asked.closed}
-            options |= {"active": active, "backend": asked.backend}
-            sums = pair_sum_on_one(fn, x, asked.cutoff, theirs, **options)
+            sums = pair_sum_on_one(fn, x, asked.cutoff, theirs, **options, **asked.options(particles, active))
         else:
             sums = pair_sum_on_one(fn, x, None, theirs, neighbors=jax.tree.map(lambda leaf: leaf[0], local), **options)
         return jax.tree.map(lambda leaf: mark_rows(leaf[: particles.sizes.particles], good), sums)
