@@ -11,7 +11,7 @@ nothing varies; its results then vary over all axes over which any operand does.
 import contextlib
 import contextvars
 import functools
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -56,29 +56,21 @@ def call_late(fn: Callable[..., Tree], args: tuple, like: Tree) -> Tree:
 
 
 def lower_late(fn: Callable[..., Sequence[Array]]) -> Internal:
-    """Return a rule that lowers a primitive with several results by tracing a function, which may ask for the platform."""
+    """Return a rule that lowers a primitive with several results by tracing a function, which may ask for the platform.
+
+    It is traced as on a single device.
+    """
     from jax.interpreters import mlir
 
     def lower(ctx: Internal, *args: Internal, **params: Internal) -> Internal:
         platforms = ctx.platforms or ctx.module_context.platforms
-        with _lowering_for(platforms[0] if len(platforms) == 1 else None):
-            return mlir.lower_fun(fn, multiple_results=True)(ctx, *args, **params)
+        token = _platform.set(platforms[0] if len(platforms) == 1 else None)
+        try:
+            return mlir.lower_fun(fn, multiple_results=True)(ctx.replace(avals_in=unvarying_types(ctx.avals_in)), *args, **params)
+        finally:
+            _platform.reset(token)
 
     return lower
-
-
-@contextlib.contextmanager
-def _lowering_for(platform: str | None) -> Iterator[None]:
-    token = _platform.set(platform)
-    try:
-        yield
-    finally:
-        _platform.reset(token)
-
-
-def _call(*args: Array, fn: Callable[..., list[Array]], types: tuple) -> list[Array]:
-    del types
-    return fn(*args)
 
 
 @functools.cache
@@ -89,19 +81,19 @@ def _late() -> Internal:
     late = Primitive("jfrnn_late")
     late.multiple_results = True
 
-    def infer(*_: Aval, fn: Callable, types: tuple) -> list[ShapedArray]:
-        del fn
-        return [ShapedArray(*kind) for kind in types]
+    def call(*args: Array, fn: Callable[..., list[Array]], types: tuple) -> list[Array]:
+        del types
+        return fn(*args)
 
     def batch(args: Sequence[Array], dims: Sequence[int | None], *, fn: Callable, types: tuple) -> tuple[list[Array], list[int]]:
         size = next(x.shape[d] for x, d in zip(args, dims, strict=True) if d is not None)
         batched = tuple(((size, *shape), dtype) for shape, dtype in types)
         return late.bind(*args, fn=jax.vmap(fn, tuple(dims)), types=batched), [0] * len(types)
 
-    late.def_impl(_call)  # outside a program, as under `jax.disable_jit`
-    late.def_abstract_eval(infer)
+    late.def_impl(call)  # outside a program, as under `jax.disable_jit`
+    late.def_abstract_eval(lambda *_, fn, types: [ShapedArray(*kind) for kind in types])
     batching.primitive_batchers[late] = batch
-    mlir.register_lowering(late, lower_late(_call))
+    mlir.register_lowering(late, lower_late(call))
     return late
 
 
@@ -163,6 +155,8 @@ def call_apart(fn: Callable[..., Tree], *args: Tree) -> Tree:
     axes = varying_axes(args)
     if not axes:
         return fn(*args)
+    from jax.extend.core import jaxpr_as_fun
+
     leaves, structure = jax.tree.flatten(args)
     is_static = [isinstance(x, int) for x in leaves]
     arrays = [lax.stop_gradient(jnp.asarray(x)) for x, static in zip(leaves, is_static, strict=True) if not static]
@@ -172,31 +166,5 @@ def call_apart(fn: Callable[..., Tree], *args: Tree) -> Tree:
         whole = [x if static else next(given) for x, static in zip(leaves, is_static, strict=True)]
         return fn(*jax.tree.unflatten(structure, whole))
 
-    shapes = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in arrays]
-    jaxpr, out = jax.make_jaxpr(flat, return_shape=True)(*shapes)
-    results = vary(_program().bind(*arrays, jaxpr=jaxpr), axes)
-    return jax.tree.unflatten(jax.tree.structure(out), results)
-
-
-@functools.cache
-def _program() -> Internal:
-    """Return the primitive of a program that varies over nothing; `vary_leaf` marks its results afterwards."""
-    from jax.extend.core import Primitive, jaxpr_as_fun
-    from jax.interpreters import batching, mlir
-
-    program = Primitive("jfrnn_program")
-    program.multiple_results = True
-    program.def_impl(lambda *args, jaxpr: jax.jit(jaxpr_as_fun(jaxpr))(*args))
-    program.def_abstract_eval(lambda *_, jaxpr: [ShapedArray(x.shape, x.dtype) for x in jaxpr.out_avals])
-
-    def lower(ctx: Internal, *args: Internal, jaxpr: Internal) -> Internal:
-        return mlir.lower_fun(jaxpr_as_fun(jaxpr))(ctx.replace(avals_in=jaxpr.in_avals), *args)
-
-    def batch(args: Sequence[Array], dims: Sequence[int | None], *, jaxpr: Internal) -> tuple[list[Array], list[int]]:
-        mapped = jax.vmap(jaxpr_as_fun(jaxpr), dims)
-        results = program.bind(*args, jaxpr=jax.make_jaxpr(mapped)(*(jax.ShapeDtypeStruct(x.shape, x.dtype) for x in args)))
-        return results, [0] * len(results)
-
-    mlir.register_lowering(program, lower)
-    batching.primitive_batchers[program] = batch
-    return program
+    program, like = jax.make_jaxpr(flat, return_shape=True)(*(jax.ShapeDtypeStruct(x.shape, x.dtype) for x in arrays))
+    return vary(call_late(jaxpr_as_fun(program), tuple(arrays), like), axes)
