@@ -210,11 +210,8 @@ class Box:
         return self._replace(numbers=other.numbers)
 
     def _replace(self, **changed: Any) -> "Box":  # noqa: ANN401
-        box = object.__new__(Box)
         fields = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)} | changed
-        for name, value in fields.items():
-            object.__setattr__(box, name, value)
-        return box
+        return Box.tree_unflatten((), fields.values())
 
     @property
     def kind(self) -> tuple[tuple[bool, ...], tuple[int, ...] | None, bool, bool, tuple[int, ...] | None]:

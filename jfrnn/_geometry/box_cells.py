@@ -159,9 +159,7 @@ def box_runs(
     for axis in range(dim - 1, 0, -1):
         row = (row + at[axis]) * counts[..., axis - 1]
     row = row + cells.first[of][:, None]
-    code = jnp.zeros_like(rest)
-    for axis, most in enumerate(lattice.images.reach):
-        code = code * (2 * most + 1) + jnp.where(turning[..., axis], shift[axis], 0) + most
+    code = lattice.images.code_of(jnp.where(turning[..., axis], shift[axis], 0) for axis in range(dim))
     begin, end = (cells.start.at[jnp.where(there, row + x, 0)].get(mode="clip") for x in (begin, end))
     return begin, jnp.where(there, jnp.maximum(end, begin), begin), jnp.where(there, code, lattice.images.home)
 

@@ -301,10 +301,7 @@ def line_runs(line: CellLine, cells: Cells, images: Images | None) -> tuple[Arra
     number += [system[:, None] for system in cells.along[dim:]]
     begin = (_number(number, line.strides) & np.uint32(size - 1)).astype(jnp.int32)
     length = jnp.where(cells.number[:, None] < size, jnp.maximum(last - first + 1, 0), 0)
-    code = jnp.zeros_like(first)
-    for turn, k in zip(turned, reach, strict=True):
-        code = code * (2 * k + 1) + (turn + k)
-    return *_ends(line, begin, length), code
+    return *_ends(line, begin, length), images.code_of(turned)
 
 
 def _ends(line: CellLine, begin: Array, length: Array) -> tuple[Array, Array]:

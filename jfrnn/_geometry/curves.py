@@ -138,13 +138,9 @@ def _decode(keys: Array, dim: int, bits: int, curve: Callable[[Words, int, int],
     return jnp.stack([(c & mask).astype(jnp.int32) for c in curve(_unpack(keys, dim * bits), dim, bits)], axis=-1)
 
 
-def morton_words(axes: list[Array], _: int) -> Words:
-    return _interleave(axes)
-
-
 def hilbert_words(axes: list[Array], bits: int) -> Words:
     """Return Hilbert keys; x contributes the highest of each group of d bits in the key."""
-    return _interleave(hilbert_digits(axes, bits))
+    return morton_words(hilbert_digits(axes, bits), bits)
 
 
 def hilbert_digits(axes: list[Array], bits: int, unroll: int = 2) -> list[Array]:
@@ -187,8 +183,8 @@ def _turn_levels(axes: list[Array], bits: int, unroll: int = 2, *, upwards: bool
     return lax.fori_loop(1, bits, turn, axes, unroll=unroll)
 
 
-def _interleave(axes: list[Array]) -> Words:
-    """Move bit b of axis a to bit d * b + a of the key."""
+def morton_words(axes: list[Array], _: int) -> Words:
+    """Return Morton keys: bit b of axis a is bit d * b + a of the key."""
     high = low = jnp.zeros_like(axes[0])
     for axis, c in enumerate(axes):
         first, shift = _high_part(axis, len(axes))

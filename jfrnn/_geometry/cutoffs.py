@@ -15,6 +15,10 @@ Flags = Any  # bool array of NumPy or JAX, like the argument
 RULES = ("gather", "scatter", "either", "both", "mean")  # cutoff of a pair: i's, j's, larger, smaller, mean
 SUM = "sum"  # a rule of users: the mean of doubled radii, exactly
 TABLE = "table"  # a rule of pairs of species
+# the smallest cutoff whose band of step 1 covers flushed denormals, and the largest whose cell edge is finite
+RANGE_OF = {
+    np.dtype(x.dtype): (2.0 ** (x.minexp + x.nmant + 7), 2.0 ** (x.maxexp - 1)) for x in map(np.finfo, (np.float32, np.float64))
+}
 EXCHANGED = {"gather": "scatter", "scatter": "gather"}  # rules that become another one where i and j are exchanged
 
 
@@ -150,7 +154,7 @@ def is_radius(radii: Array | np.ndarray) -> Flags:
     """Say which cutoffs the pair test can decide; 0 is valid: it finds coincident particles. NumPy input gives NumPy output."""
     dtype = np.dtype(radii.dtype)
     unsigned = np.uint32 if dtype == np.float32 else np.uint64  # bits are compared: as floats, denormals would be flushed to 0
-    low, high = (np.array(x, dtype).view(unsigned)[()] for x in cutoff_range(dtype))
+    low, high = (np.array(x, dtype).view(unsigned)[()] for x in RANGE_OF[dtype])
     bits = radii.view(unsigned) if isinstance(radii, np.ndarray) else lax.bitcast_convert_type(radii, unsigned)
     magnitude = bits << unsigned(1) >> unsigned(1)
     negative_zero = np.array(-0.0, dtype).view(unsigned)[()]
@@ -158,7 +162,7 @@ def is_radius(radii: Array | np.ndarray) -> Flags:
 
 
 def make_cutoff(value: float, dtype: np.dtype, closed: bool) -> Cutoff:
-    """Round a cutoff within `cutoff_range` to a dtype and derive the constants of the pair test."""
+    """Round a cutoff that is within `RANGE_OF` a dtype to it, and derive the constants of the pair test."""
     finfo = np.finfo(dtype)
     narrow = dtype == np.float32
     radius = dtype.type(value)
@@ -259,9 +263,3 @@ def _bounds_of_pairs(cutoffs: Cutoffs, radii: list[Array], slack: Array | None =
     if cutoffs.kinds is not None:
         outside = jnp.where(radius > 0, outside, -1)
     return inside, outside
-
-
-def cutoff_range(dtype: np.dtype) -> tuple[float, float]:
-    """Return the smallest cutoff whose band of step 1 covers flushed denormals, and the largest whose cell edge is finite."""
-    finfo = np.finfo(dtype)
-    return 2.0 ** (finfo.minexp + finfo.nmant + 7), 2.0 ** (finfo.maxexp - 1)

@@ -99,10 +99,7 @@ def squared_distance(difference: list[Array], cutoff: "Cutoff | Cutoffs") -> Arr
     """Sum the squares of the scaled differences, one array per axis, in working precision (step 1)."""
     if cutoff.scaled:
         difference = [component * cutoff.unit_scale for component in difference]
-    total = difference[0] * difference[0]
-    for component in difference[1:]:
-        total = total + component * component
-    return total
+    return functools.reduce(jnp.add, (component * component for component in difference))
 
 
 class Shifted(NamedTuple):
@@ -244,11 +241,6 @@ class _Threshold(NamedTuple):
     scale: Array
     less: list[Array] | None = None
 
-    @property
-    def times(self) -> int:
-        """The factor of the distance that is compared with the sum of the radii."""
-        return len(self.radii)
-
 
 def _threshold(pair: Pair, cutoff: Cutoff | Cutoffs) -> _Threshold:
     if isinstance(cutoff, Cutoff):
@@ -269,7 +261,7 @@ def _fixed_sign(pair: Pair, threshold: _Threshold, by_axis: bool = False) -> Arr
         scale = threshold.scale[None] if threshold.scale.ndim else threshold.scale
         limbs, known = _square_in_units(_Component(pair.a, pair.b, pair.lattice_terms()), scale)
     total, known = [functools.reduce(lax.add, limb) for limb in limbs], functools.reduce(lax.bitwise_and, known)
-    less, times = threshold.less, threshold.times**2
+    less, times = threshold.less, len(threshold.radii) ** 2
     if less is None:
         numbers, wholes = zip(*(_in_units(x, threshold.scale) for x in threshold.radii), strict=True)
         less = [-x for x in _square_limbs(*map(functools.partial(functools.reduce, lax.add), zip(*numbers, strict=True)))]
@@ -360,7 +352,7 @@ def _integer_sign(pair: Pair, threshold: _Threshold) -> Array:
     ends = radii[0], -radii[1] if len(radii) == 2 else jnp.zeros((), dtype)
     ends = [jnp.broadcast_to(x.reshape(1, -1), (1, size)) for x in ends]
     limbs = limbs_of(jnp.concatenate([pair.b, ends[0], pair.a, ends[1]]), count)  # [2 (d + 1), k, ...]
-    times = np.array([threshold.times] * dim + [1], whole)[:, None, None]
+    times = np.array([len(radii)] * dim + [1], whole)[:, None, None]
     squared = (limbs[: dim + 1] - limbs[dim + 1 :]) * times
     for shift, vector in pair.lattice_terms():
         translation = shift.astype(whole)[..., None] * limbs_of(vector, count)

@@ -218,10 +218,7 @@ def exclude_in_lattice(
     shifts = shifts - unpack_turns(wrapped.query_turns, dim)[row] + unpack_turns(wrapped.turns, dim)[rows.others]
     reach = np.array(images.reach, np.int32)
     there = (jnp.abs(shifts) <= jnp.where(periodic, reach, 0)).all(axis=1)
-    code = jnp.zeros_like(row)
-    for k in range(dim):
-        code = code * (2 * reach[k] + 1) + shifts[:, k] + reach[k]
-    return _sorted(rows, jnp.where(there, code, -1))
+    return _sorted(rows, jnp.where(there, images.code_of(shifts.T), -1))
 
 
 def _sorted(rows: ExcludedRows, codes: Array) -> ExcludedCodes:

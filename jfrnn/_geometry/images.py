@@ -5,11 +5,13 @@ that is 0 along axes that are not periodic.
 """
 
 import contextlib
+import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from jax import Array
 from jax.core import Tracer
 
 from jfrnn._geometry.box import Box, check_box_values, searched_vectors
@@ -69,6 +71,12 @@ class Images(NamedTuple):
     def home(self) -> int:
         """The image code of the shift 0."""
         return (self.total - 1) // 2
+
+    def code_of(self, shifts: Iterable[Array]) -> Array:
+        """Return the image codes of shifts within reach, whole numbers along each axis."""
+        first, *others = (shift + most for shift, most in zip(shifts, self.reach, strict=True))
+        bases = (2 * most + 1 for most in self.reach[1:])
+        return functools.reduce(lambda code, axis: code * axis[0] + axis[1], zip(bases, others, strict=True), first)
 
     @property
     def dtype(self) -> np.dtype:

@@ -12,7 +12,7 @@ from jax.core import Tracer
 
 from jfrnn._geometry.batch import Batch
 from jfrnn._geometry.box import Box
-from jfrnn._geometry.cutoffs import RULES, SUM, TABLE, Radii, cutoff_range, is_radius
+from jfrnn._geometry.cutoffs import RANGE_OF, RULES, SUM, TABLE, Radii, is_radius
 from jfrnn._tracing import Given, as_array, as_dtype, gather, make_on_host, on_device, refuse_forks
 
 _MOST_POINTS = 2**31 - 32
@@ -99,7 +99,7 @@ def check_cutoff(cutoff: Given, dtype: np.dtype) -> float:
     value = float(cutoff)
     if not (math.isfinite(value) and value > 0):
         raise ValueError(f"cutoff must be positive and finite, got {value}.")
-    low, high = cutoff_range(dtype)
+    low, high = RANGE_OF[dtype]
     if not low <= value <= high:
         raise ValueError(
             f"cutoff={value} is outside [{low:.1e}, {high:.1e}], the range in which {dtype} decides pairs exactly: "
@@ -219,7 +219,7 @@ def largest_known(radii: Radii) -> float | None:
     if any(isinstance(x, Tracer) for x in given):
         return None
     values: Any = np.concatenate(jax.device_get(given))
-    low, high = cutoff_range(values.dtype)
+    low, high = RANGE_OF[values.dtype]
     return float(np.max(values[(values >= low) & (values <= high)], initial=0)) or 1.0
 
 
@@ -227,7 +227,7 @@ def check_skin(skin: object, cutoff: float, dtype: np.dtype) -> float:
     """Return a static skin, rounded to the dtype of the positions; 0 means no skin."""
     if isinstance(skin, Tracer | bool) or not isinstance(skin, int | float | np.number):
         raise TypeError(f"skin must be a number known while tracing, got {_describe(skin)}.")
-    value, (least, most) = float(dtype.type(skin)), cutoff_range(dtype)
+    value, (least, most) = float(dtype.type(skin)), RANGE_OF[dtype]
     low, high = 2 * least, most - cutoff
     if not (value == 0 or low <= value <= high):
         raise ValueError(

@@ -50,8 +50,7 @@ def reduced_basis(vectors: np.ndarray, periodic: Sequence[bool]) -> tuple[Basis,
 
 def _shorten(rows: list[list[Fraction]], numbers: list[list[int]], k: int, others: list[int]) -> bool:
     """Subtract whole multiples of the other vectors from row k if that makes it shorter; return whether it did."""
-    best: tuple[int, ...] = (0,) * len(others)
-    tried = list(product((-1, 0, 1), repeat=len(others)))
+    tried: list[tuple[int, ...]] = list(product((-1, 0, 1), repeat=len(others)))
     tried += [tuple(round(_dot(rows[k], rows[j]) / _dot(rows[j], rows[j])) if j == i else 0 for j in others) for i in others]
     best = min(tried, key=lambda times: _dot(*[_less(rows, k, others, times)] * 2))
     after = _less(rows, k, others, best)

@@ -9,7 +9,7 @@ import reference
 
 import jfrnn
 from jfrnn._geometry import cell_line as _cells
-from jfrnn._geometry.cutoffs import cutoff_range
+from jfrnn._geometry.cutoffs import RANGE_OF
 
 cell_edge, cell_coordinate = jax.jit(_cells.cell_edge), jax.jit(_cells.cell_coordinate)
 
@@ -73,7 +73,7 @@ def test_no_pair_is_two_cells_apart(dtype, cutoff, reach):
 
 def test_flushed_denormals_stay_within_the_edge_s_margin(dtype):
     """A negative denormal may count as 0 and land one cell up: the edge exceeds every cutoff by more than a denormal."""
-    cutoff = dtype(np.nextafter(dtype(2 * cutoff_range(np.dtype(dtype))[0]), dtype(0)))
+    cutoff = dtype(np.nextafter(dtype(2 * RANGE_OF[np.dtype(dtype)][0]), dtype(0)))
     assert Fraction(float(edge_of(cutoff, dtype))) - Fraction(float(cutoff)) > 2 * Fraction(float(np.finfo(dtype).tiny))
 
 

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 import jfrnn
-from jfrnn._geometry.cutoffs import Radii, cutoff_range, make_cutoff, make_cutoffs
+from jfrnn._geometry.cutoffs import RANGE_OF, Radii, make_cutoff, make_cutoffs
 from jfrnn._geometry.exact import _UNKNOWN, Pair, _fixed_sign, _integer_sign, _threshold, is_pair_of
 from jfrnn._geometry.images import images_of
 from jfrnn._geometry.lattice import make_lattice, shift_pairs
@@ -35,7 +35,7 @@ def floats(dtype):
 
 def cutoffs(dtype):
     width = np.dtype(dtype).itemsize * 8
-    low, high = cutoff_range(np.dtype(dtype))
+    low, high = RANGE_OF[np.dtype(dtype)]
     return st.one_of(st.floats(low, high, width=width), st.integers(1, 100).map(float))
 
 
@@ -63,7 +63,7 @@ def test_cutoff_is_a_distance_that_occurs(dtype, data):
     ulps = data.draw(st.integers(-2, 2))
     with np.errstate(all="ignore"):
         distance = np.hypot(*(points[1] - points[0]).astype(np.float64)).astype(dtype)
-    low, high = cutoff_range(np.dtype(dtype))
+    low, high = RANGE_OF[np.dtype(dtype)]
     hypothesis.assume(2 * low < distance < high / 2)
     cutoff = float(distance + ulps * np.spacing(distance))
     for closed in (False, True):

@@ -16,7 +16,7 @@ from test_box import image_pairs, masked_images
 
 import jfrnn
 from jfrnn._engine import warp
-from jfrnn._geometry.cutoffs import RULES, Radii, cutoff_range, is_radius, make_cutoffs
+from jfrnn._geometry.cutoffs import RANGE_OF, RULES, Radii, is_radius, make_cutoffs
 from jfrnn.cases.radii import RADII_CASES
 
 SLOW = pytest.mark.slow
@@ -379,7 +379,7 @@ def test_valid_cutoffs_are_told_alike_on_the_host():
     for dtype in (np.float32, np.float64):
         info = np.finfo(dtype)
         given = [0.0, -0.0, 1.0, -1.0, np.inf, np.nan, -np.nan, info.smallest_subnormal, info.tiny, info.max, info.max / 4]
-        given += [x * f for x in (cutoff_range(np.dtype(dtype))[0],) for f in (0.5, 1.0, 2.0)]
+        given += [x * f for x in (RANGE_OF[np.dtype(dtype)][0],) for f in (0.5, 1.0, 2.0)]
         radii = np.array(given, dtype)
         valid = is_radius(radii)
         assert isinstance(valid, np.ndarray)
