@@ -28,20 +28,16 @@ def factor_out(scalars: Scalars, outputs: Iterable[int]) -> dict[int, int]:
     needed, found = scalars.dependencies(outputs), {number: number for number in outputs}
     for scaled in (False, True):
         try:
-            other = _with_factors_out(scalars, needed, outputs, scaled)
+            work = _Factors(scalars, needed, scaled)
+            for number in sorted(needed):
+                work.visit(number)
+            other = {number: work.better[number] for number in outputs}
             collected = collect_scales(scalars, other.values())
         except NoTranslationError:  # it would take more scalars than there may be
             continue
         both = other, {number: collected[better] for number, better in other.items()}
         found = min(found, *both, key=lambda each: len(scalars.dependencies(each.values())))
     return found
-
-
-def _with_factors_out(scalars: Scalars, needed: set[int], outputs: Iterable[int], scaled: bool) -> dict[int, int]:
-    work = _Factors(scalars, needed, scaled)
-    for number in sorted(needed):
-        work.visit(number)
-    return {number: work.better[number] for number in outputs}
 
 
 class _Factors:

@@ -26,10 +26,6 @@ def _move(move: Callable[..., Values]) -> Rule:
     return lambda eqn, inputs: [np.asarray(move(inputs[0], eqn.params))]
 
 
-def _same(_: Equation, inputs: list[Values]) -> list[Values]:
-    return inputs
-
-
 # --- element-wise -----------------------------------------------------------------------------------------------------
 
 
@@ -173,7 +169,14 @@ _SAME_NAME = [
     *("sin", "cos", "tan", "asin", "acos", "atan", "atan2", "sinh", "cosh", "tanh"),
 ]
 
-TABLE: dict[str, Rule] = {name: _each(name) for name in _SAME_NAME} | {
+_NESTED = ["jit", "pjit", "closed_call", "core_call", "checkpoint", "remat", "remat2"]
+_NESTED += ["custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr"]
+# `reshard` is for arrays that fn closes over from outside `shard_map`: every device has all of them
+_WITHOUT_EFFECT = ["copy", "copy_p", "reshard", "name", "optimization_barrier", "stop_gradient"]
+
+TABLE: dict[str, Rule] = {name: _each(name) for name in _SAME_NAME}
+TABLE |= dict.fromkeys(_NESTED, _inline) | dict.fromkeys(_WITHOUT_EFFECT, lambda _, inputs: inputs)
+TABLE |= {
     # element-wise, under another name
     "add_any": _each("add"),
     "and": _each("both"),
@@ -186,12 +189,6 @@ TABLE: dict[str, Rule] = {name: _each(name) for name in _SAME_NAME} | {
     "round": lambda eqn, inputs: [eqn.each("round_even" if int(eqn.params["rounding_method"]) else "round", *inputs)],
     "select_n": _select,
     "convert_element_type": lambda eqn, inputs: [eqn.cast(inputs[0], eqn.outputs[0].dtype)],
-    "copy": _same,
-    "copy_p": _same,
-    "reshard": _same,  # for arrays that fn closes over from outside `shard_map`: every device has all of them
-    "name": _same,
-    "optimization_barrier": _same,
-    "stop_gradient": _same,
     # reductions
     "reduce_sum": _reduce("add", lambda _: 0),
     "reduce_prod": _reduce("mul", lambda _: 1),
@@ -225,16 +222,5 @@ TABLE: dict[str, Rule] = {name: _each(name) for name in _SAME_NAME} | {
     "gather": gather,
     "scatter": scatter(set_window),
     "scatter-add": scatter(add_window),
-    # nested functions
-    "jit": _inline,
-    "pjit": _inline,
-    "closed_call": _inline,
-    "core_call": _inline,
-    "custom_jvp_call": _inline,
-    "custom_vjp_call": _inline,
-    "custom_vjp_call_jaxpr": _inline,
-    "checkpoint": _inline,
-    "remat": _inline,
-    "remat2": _inline,
     "cond": _cond,
 }

@@ -268,8 +268,7 @@ class Kept:
         given = self.given
         slots = Topology(given.idx, None, self.slots_by_source, None, given.sources.shape[0], 1, mutual=False, native=True)
         found = slots.with_reverse()
-        if found.starts is None or found.lengths is None:
-            raise TypeError("a list that is its own mirror image is never flipped.")
+        assert found.starts is not None and found.lengths is not None  # no list that is its own mirror image is flipped
         return given._replace(reversal=(found.slots, found.starts, found.lengths))
 
 
@@ -301,37 +300,25 @@ def sum_pairs(relation: Relation, term: Term, operands: Groups, compensated: boo
 
     def visit(block: Block, out: list) -> list:
         def add(slots: Slots, state: list) -> list:
-            summands = evaluate(relation, term, operands, block, slots)
-            return [add_one(*parts) for add_one, *parts in zip(adders, state, summands, strict=True)]
+            place, added = jnp.where(slots.real, slots.source, rows), []
+            for old, terms, total in zip(state, evaluate(relation, term, operands, block, slots), term.totals, strict=True):
+                if total:
+                    added.append(adder.add(old, terms.reshape(1, -1, *terms.shape[2:]), squeeze=True))
+                else:
+                    added.append(adder.scatter(old, place, terms) if relation.flipped else adder.add(old, terms))
+            return added
 
-        def add_total(state: tuple, terms: Array) -> tuple:
-            return adder.add(state, terms.reshape(1, -1, *terms.shape[2:]), squeeze=True)
-
-        kinds = {True: add_total, False: adder.add}
-        adders = [kinds[total] for total in term.totals]
-        begin = [
-            old if total else jax.tree.map(lambda all_rows: all_rows[block.query], old)
-            for old, total in zip(out, term.totals, strict=True)
-        ]
-        done = block.fold(add, begin)
-        place = jnp.where(block.fresh, block.query, rows)
+        if relation.flipped:
+            return block.fold(add, out)
+        of_all = list(zip(out, term.totals, strict=True))
+        begin = [old if total else jax.tree.map(lambda all_rows: all_rows[block.query], old) for old, total in of_all]
+        done, place = block.fold(add, begin), jnp.where(block.fresh, block.query, rows)
         return [
             new if total else jax.tree.map(lambda all_rows, some: all_rows.at[place].set(some, mode="drop"), old, new)
-            for old, new, total in zip(out, done, term.totals, strict=True)
+            for (old, total), new in zip(of_all, done, strict=True)
         ]
 
-    def visit_flipped(block: Block, out: list) -> list:
-        def add(slots: Slots, state: list) -> list:
-            summands = evaluate(relation, term, operands, block, slots)
-            place = jnp.where(slots.real, slots.source, rows)
-            return [
-                adder.add(old, terms.reshape(1, -1, *terms.shape[2:]), squeeze=True) if total else adder.scatter(old, place, terms)
-                for old, terms, total in zip(state, summands, term.totals, strict=True)
-            ]
-
-        return block.fold(add, out)
-
-    found = relation.fold(term.elements, visit_flipped if relation.flipped else visit, start)
+    found = relation.fold(term.elements, visit, start)
     results = [adder.result(state) for state in found]
     if not isinstance(relation, Searched) or not any(term.marks):
         return results
@@ -365,9 +352,7 @@ class _Adder:
         return tuple(jnp.zeros((*rows, *like.shape), like.dtype) for _ in range(1 + self.compensated))
 
     def result(self, state: tuple[Array, ...]) -> Array:
-        if not self.compensated:
-            return state[0]
-        return rounded_sum(*state)
+        return rounded_sum(*state) if self.compensated else state[0]
 
     def scatter(self, state: tuple[Array, ...], place: Array, terms: Array) -> tuple[Array, ...]:
         """Add terms [b, g, ...] to the rows at `place`; these additions are not compensated."""

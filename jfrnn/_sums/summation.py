@@ -21,7 +21,7 @@ from jfrnn._sums.exchange import signs_of
 from jfrnn._sums.fused import can_sum_list, check
 from jfrnn._sums.joint import lower_sum
 from jfrnn._sums.relations import Kept, Relation, Searched, sum_pairs
-from jfrnn._sums.terms import Derived, Groups, Term, choose, is_moving, join, tangent, transpose
+from jfrnn._sums.terms import Groups, Term, choose, is_moving, join, tangent, transpose
 
 Structure = Any  # the `PyTreeDef` of a relation, which type checkers do not accept as a type
 
@@ -98,19 +98,14 @@ def _transpose(cotangents: list, *args: tracing.Internal, term: Term, structure:
         if rules.sides:
             side = tuple((given.own + given.others)[k] for k in rules.sides)
             given = Groups(given.shared, side, side)
-        results += _bind_derived(leaves, given, rules.along, structure, compensated)
+        results += _bind(leaves, choose(given, rules.along.needed), rules.along.term, structure, compensated)
     if rules.across is not None:
         exchanged, other_structure = jax.tree.flatten(relation.reverse())
-        results += _bind_derived(
-            exchanged, Groups(given.shared, given.others, given.own), rules.across, other_structure, compensated
-        )
+        turned = choose(Groups(given.shared, given.others, given.own), rules.across.needed)
+        results += _bind(exchanged, turned, rules.across.term, other_structure, compensated)
     found, joint = iter(results), iter(rules.joint)
     flags = [flag for group in linear[:2] for flag in group] + [flag and not next(joint, False) for flag in linear.others]
     return [None] * cut + [next(found) if flag else None for flag in flags]
-
-
-def _bind_derived(leaves: list, operands: Groups, derived: Derived, structure: Structure, compensated: bool) -> list[Array]:
-    return _bind(leaves, choose(operands, derived.needed), derived.term, structure, compensated)
 
 
 def _batch(args: tuple, dims: tuple, **params: tracing.Internal) -> tuple[list[Array], list[int]]:
