@@ -201,17 +201,10 @@ class Box:
             reach, nearest = count_cells(searched_vectors(self, single), flags, self.orthogonal, radius, single)
         return (0,) * self.dim if nearest else reach
 
-    def of_list(self, images: tuple[int, ...] | None) -> "Box":
-        """Return this box as that of a list with so many images."""
-        return self._replace(images=None, images_of_list=images)
-
-    def counted_as(self, other: "Box") -> "Box":
-        """Return this box with the short vectors of another one, which shifts of a list count."""
-        return self._replace(numbers=other.numbers)
-
-    def _replace(self, **changed: Any) -> "Box":  # noqa: ANN401
-        fields = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)} | changed
-        return Box.tree_unflatten((), fields.values())
+    def of_list(self, images: tuple[int, ...] | None, like: "Box | None" = None) -> "Box":
+        """Return this box as that of a list with so many images, whose shifts count the short vectors of `like`, a box before."""
+        arrays = self.vectors, self.origin, self.flags, self.numbers if like is None else like.numbers
+        return Box.tree_unflatten((self.periodic, None, self.per_system, self.fractional, images), arrays)
 
     @property
     def kind(self) -> tuple[tuple[bool, ...], tuple[int, ...] | None, bool, bool, tuple[int, ...] | None]:

@@ -54,11 +54,6 @@ def cell_coordinate(x: Array, edge: Array) -> Array:
     return jnp.where(x < 0, -1 - quotient, quotient)
 
 
-def cell_remainder(x: Array, cell: Array, edge: Array) -> Array:
-    """Return the distance of |x| from the start of its cell, exactly; in [0, edge) unless cells are too far away to resolve."""
-    return _remainder(jnp.abs(x), jnp.where(x < 0, -1 - cell, cell), edge)
-
-
 def _remainder(magnitude: Array, quotient: Array, edge: Array) -> Array:
     half = 2.0 ** (12 if edge.dtype == np.float32 else 26)
     high = jnp.floor(quotient / half) * half
@@ -216,7 +211,10 @@ def table_size(sources: int) -> int:
 
 def _part_of(x: Array, cell: Array, edge: Array) -> Array:
     """Return the part of its cell in which each open coordinate lies, uint32; below 0, cells are mirrored."""
-    part = cell_coordinate(cell_remainder(x, cell, edge), edge / FINE)
+    from_start = _remainder(
+        jnp.abs(x), jnp.where(x < 0, -1 - cell, cell), edge
+    )  # exactly, unless cells are too far away to resolve
+    part = cell_coordinate(from_start, edge / FINE)
     return jnp.clip(jnp.where(x < 0, FINE - 1 - part, part), 0, FINE - 1).astype(jnp.int32).astype(jnp.uint32)
 
 

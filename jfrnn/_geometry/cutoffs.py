@@ -196,8 +196,7 @@ def make_cutoffs(radii: Radii, closed: bool, skin: float = 0.0) -> Cutoffs:
 
 
 def _make_cutoffs_of_kinds(radii: Radii, given: Array, closed: bool, skin: float) -> Cutoffs:
-    if radii.sources is None or radii.queries is None:
-        raise TypeError("a table of cutoffs needs the species of sources and queries.")
+    assert radii.sources is not None and radii.queries is not None  # the species
     table = jnp.where(is_radius(given) & (given > 0), _sum_rounded_up(given, skin), -1)
     farthest = jnp.maximum(jnp.max(table, axis=1, initial=0), 0)
     kinds = [jnp.clip(x, 0, len(table) - 1) for x in (radii.sources, radii.queries)]

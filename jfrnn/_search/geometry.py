@@ -11,7 +11,7 @@ from jax import Array, lax
 
 from jfrnn import _geometry as geometry
 from jfrnn._engine import KeptList, kept_mask
-from jfrnn._search.present import ImagesMade, Present, one_each
+from jfrnn._search.present import ImageCodes, Present, one_each
 from jfrnn._tracing import call_apart, compile_program, own_transfers
 
 
@@ -125,11 +125,11 @@ def _find_slots(present: Present, ends: Ends | None) -> _Slots:
     difference = gather(sources, topology) - rows[:, None, :]
     if ends is None:
         return _Slots(used, neighbor, difference, None)
-    lattice, codes = ends.of_rows, present.images[0]
+    lattice, (codes, made) = ends.of_rows, present.images
     if codes is None:
         shifts = geometry.nearest_shifts(difference, lattice)
     else:
-        turns, query_turns = _turns_now(present.images, ends)
+        turns, query_turns = _turns_now(codes, made, ends)
         shifts = _shifts_of_codes(codes.codes, used, lattice.images, query_turns[:, None], turns[neighbor])
     if present.forward:  # in the given vectors
         own = neighbor == lax.broadcasted_iota(jnp.int32, idx.shape, 0)
@@ -141,11 +141,11 @@ def _find_slots(present: Present, ends: Ends | None) -> _Slots:
 
 def edge_shifts(difference: Array, real: Array, present: Present, receivers: Array, ends: Ends, lattice: geometry.Lattice) -> Array:
     """Return the lattice shifts [total, 1, d], whole floats, of edges between near points; `lattice` is that of all, or of each."""
-    codes = present.images[0]
+    codes, made = present.images
     if codes is None:
         return geometry.nearest_shifts(difference, lattice)
     senders, receivers = (jnp.where(real, named, 0) for named in (present.topology.idx[:, 0], receivers))
-    turns, query_turns = _turns_now(present.images, ends)
+    turns, query_turns = _turns_now(codes, made, ends)
     return _shifts_of_codes(codes.codes, real, lattice.images, query_turns[receivers], turns[senders])[:, None]
 
 
@@ -153,8 +153,7 @@ def edge_shifts(difference: Array, real: Array, present: Present, receivers: Arr
 def lattice_shifts(present: Present) -> Array:
     """Return the lattice shift of each slot between points as they are given, [m, capacity, d] int32; 0 in unused slots."""
     ends = ends_of(present)
-    if ends is None:
-        raise TypeError("a list in open space has no shifts.")
+    assert ends is not None  # no list in open space is asked
     slots = _find_slots(present, ends)
     assert slots.shifts is not None
     return _given_shifts(slots, slots.shifts, ends)
@@ -191,7 +190,7 @@ def vectors_of(present: Present, as_given: bool = False) -> tuple[Array, Array, 
 
 def kept_list(present: Present) -> KeptList:
     """Return a list as Warp's kernels take it: points near the box, and one lattice, or one per system; all are constants."""
-    topology, box, kind, batch = present.topology, present.box, present.kind, present.batch
+    topology, box, kind, batch, (codes, made) = present.topology, present.box, present.kind, present.batch, present.images
     sources, rows = lax.stop_gradient((present.sources, present.rows))
     systems, turns, lattice = None, None, None
     if box is not None and kind is not None:
@@ -202,15 +201,14 @@ def kept_list(present: Present) -> KeptList:
             of_sources, of_rows = map(lattice.of_rows, systems)
         ends = Ends(geometry.bring_near(sources, of_sources), geometry.bring_near(rows, of_rows), of_sources, of_rows)
         sources, rows = ends.sources.points, ends.rows.points
-        turns = None if present.images[0] is None else _turns_now(present.images, ends)
+        turns = None if codes is None else _turns_now(codes, made, ends)
     fixed = lax.stop_gradient((sources, rows, turns, present.cutoffs, lattice))
     return KeptList(topology.idx, present.count, topology.codes, *fixed, topology.order, None, systems)
 
 
 def kept_shifts(given: KeptList) -> Array:
     """Return the lattice shifts of the slots of a list in a box, [m, capacity, d] whole floats, 0 in unused slots."""
-    if given.lattice is None:
-        raise TypeError("a list in open space has no shifts.")
+    assert given.lattice is not None  # no list in open space is asked
     lattice = given.lattice if given.systems is None else given.lattice.of_rows(given.systems[1])
     used = given.idx < given.sources.shape[0]
     neighbor = jnp.where(used, given.idx, 0)
@@ -227,16 +225,13 @@ def _shifts_of_codes(codes: Array, used: Array, images: geometry.Images, of_rows
     return jnp.asarray(images.shifts).astype(of_rows.dtype)[image] + of_rows - of_sources
 
 
-def _turns_now(images: ImagesMade, ends: Ends) -> tuple[Array, Array]:
+def _turns_now(codes: ImageCodes, made: tuple[Array, Array | None] | None, ends: Ends) -> tuple[Array, Array]:
     """Return the lattice vectors between the cell and near sources [n, d] and rows [m, d], in whole floats.
 
     They are those of the time when the list was made, plus the translations since then.
     So an image code denotes the same image after positions have been wrapped.
     """
     sources, rows, lattice = ends.sources.points, ends.rows.points, ends.of_rows
-    codes, made = images
-    if codes is None:
-        raise TypeError("pairs of this list have one image.")
     both = [codes.turns] if codes.query_turns is None else [codes.turns, codes.query_turns]
     turns = [geometry.unpack_turns(x, lattice.dim).astype(sources.dtype) for x in both]
     if made is not None:

@@ -295,7 +295,7 @@ class KeptSearch(KeptOptions):
         elif self.box is None:
             raise ValueError("this list was made without a periodic box: leave box out.")
         elif (box := geometry.check_box(box, sources, like=self.box)) is not None:
-            box = geometry.round_box(box.counted_as(self.box).of_list(self.box.images_of_list), problem.dtype)
+            box = geometry.round_box(box.of_list(self.box.images_of_list, like=self.box), problem.dtype)
         if box is not None and box.fractional:
             sources, rows = real_points(sources, rows, box, self.batch, problem.options.engine.native)
         return sources, sources if rows is None else rows, box

@@ -215,6 +215,5 @@ class Present:
         """The cutoff of pairs, with the constants of its test."""
         if isinstance(self.cutoff, Cutoff):
             return self.cutoff
-        if self.cutoff is None:
-            raise TypeError("a list has a cutoff or radii.")
+        assert self.cutoff is not None  # who takes all pairs does not ask
         return make_cutoffs(lax.stop_gradient(self.cutoff), self.closed)

@@ -75,8 +75,7 @@ class Problem:
         """Return the operands of this search for these particles."""
         if radii is not None:
             return engine.Inputs(sources, queries, active, box, radii, batch, exclude)
-        if self.cutoff is None:
-            raise TypeError("a search needs a cutoff or radii.")
+        assert self.cutoff is not None  # without radii there is one
         reach = list_radius(self.cutoff, self.skin, self.dtype)
         cutoff = geometry.make_cutoff(reach, self.dtype, self.options.closed)
         return engine.Inputs(sources, queries, active, box, cutoff, batch, exclude)

@@ -203,8 +203,7 @@ def _update(particles: Particles, nbrs: Neighbors) -> tuple[Particles, Neighbors
 def _is_stale(particles: Particles, halo: Halo, local: NeighborList) -> Array:
     """Say on every shard whether particles of any shard moved too far, or are other ones; [] bool."""
     local, own = jax.tree.map(lambda leaf: leaf[0], local), particles.sizes.particles
-    if local.verlet is None:
-        raise TypeError("a list without a skin is always stale.")
+    assert local.verlet is not None  # a list without a skin is always stale
     before = dataclasses.replace(local.verlet, positions=local.verlet.positions[:own])
     now = jnp.where((particles.ids >= 0)[:, None], particles.positions, jnp.inf)
     moved = has_moved_too_far(before, now, None, local.box, local.box_kind, None, local.skin)

@@ -123,7 +123,7 @@ def gather(x: Array) -> Array:
     Along automatic axes the compiler does this where needed. `jfrnn.distributed` divides the work instead.
     """
     spread = jax.typeof(x).sharding
-    if all(axes is None for axes in spread.spec):
+    if not any(spread.spec):
         return x
     if isinstance(x, Tracer) or not isinstance(x.sharding, NamedSharding):
         return jax.sharding.reshard(x, NamedSharding(spread.mesh, PartitionSpec()))

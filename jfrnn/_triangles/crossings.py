@@ -70,8 +70,6 @@ def _is_between(points: Array, ends: Array, shapes: Array, asked: Array) -> Arra
         left, right = left | (side > error), right | (side < -error)
     surely = above & (height > doubt) & (rest < -rest_doubt) | below & (height < -doubt) & (rest > rest_doubt)
     never = left & right | (height > doubt) & (rest > rest_doubt) | (height < -doubt) & (rest < -rest_doubt)
-
-    def segments_at(at: Array) -> Segments:
-        return Segments(points[at].T, ends[at].T, jnp.moveaxis(shapes[at], 0, -1))
-
-    return (surely & asked) | refine(asked & ~surely & ~never, segments_at, is_crossed)
+    doubtful = asked & ~surely & ~never
+    decided = refine(doubtful, lambda at: Segments(points[at].T, ends[at].T, jnp.moveaxis(shapes[at], 0, -1)), is_crossed)
+    return (surely & asked) | decided
