@@ -57,6 +57,7 @@ from jfrnn._geometry.inputs import (
     check_slack,
     check_species,
     check_table,
+    check_values,
     largest_known,
 )
 from jfrnn._geometry.integers import GUARDS, carry_limbs, fields_of, full_count, limb_bits, limb_sign, limbs_of
@@ -88,7 +89,6 @@ from jfrnn._geometry.status import (
     known_status,
     mark_rows,
     names_of_bits,
-    one_or_nan,
     pairs_and_status,
     shape_of,
     tell,

@@ -9,11 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jax.core import Tracer
+from jax.tree_util import KeyPath
 
 from jfrnn._geometry.batch import Batch
 from jfrnn._geometry.box import Box
 from jfrnn._geometry.cutoffs import RANGE_OF, RULES, SUM, TABLE, Radii, is_radius
-from jfrnn._tracing import Given, as_array, as_dtype, gather, make_on_host, on_device, refuse_forks
+from jfrnn._tracing import Given, Tree, as_array, as_dtype, gather, make_on_host, on_device, refuse_forks
 
 _MOST_POINTS = 2**31 - 32
 _MOST_KINDS = 2**12  # places in a table of their cutoffs are whole floats, too
@@ -56,8 +57,13 @@ def check_positions(name: str, positions: Given, like: Array | None = None, numb
     return on_device(positions)  # stays concrete inside jit, so that `search` can count its neighbors
 
 
-def check_again(name: str, positions: Given, dtype: np.dtype, dim: int, rows: int, what: str = "the list") -> Array:
-    """Return positions, after checking that they have the dtype, dimension and number that e.g. a list was made for."""
+def check_again(
+    name: str, positions: Given, dtype: np.dtype, dim: int, rows: int, made: Array | None, what: str = "the list"
+) -> Array:
+    """Return positions, after checking that they have the dtype, dimension and number that e.g. a list was made for.
+
+    They have to lie on the devices of `made`, an array of it, if that is given.
+    """
     points = check_positions(name, positions, numbers=np.dtype(dtype))
     if (points.dtype, points.shape[1]) != (dtype, dim):
         raise ValueError(
@@ -69,10 +75,12 @@ def check_again(name: str, positions: Given, dtype: np.dtype, dim: int, rows: in
         raise ValueError(
             f"{name} hold {points.shape[0]} {noun}, but {what} was made for {rows}: make it anew for as many as there are."
         )
+    if made is not None:
+        check_devices(name, points, made)
     return points
 
 
-def check_devices(name: str, given: Given, made: Given, what: str = "the list") -> None:
+def check_devices(name: str, given: Given, made: Given) -> None:
     """Raise if an array and an earlier result are committed to different devices; traced values are not checked."""
     if isinstance(given, Tracer) or isinstance(made, Tracer):
         return
@@ -80,8 +88,8 @@ def check_devices(name: str, given: Given, made: Given, what: str = "the list") 
         return
     here, there = (", ".join(sorted(map(str, x.devices()))) for x in (given, made))
     raise ValueError(
-        f"{name} lie on {here}, but {what} on {there}: move one of them with jax.device_put, or make {what} anew where {name} lie. "
-        "Over several devices, see jfrnn.distributed."
+        f"{name} lie on {here}, but the list on {there}: move one of them with jax.device_put, or make the list anew where {name} "
+        "lie. Over several devices, see jfrnn.distributed."
     )
 
 
@@ -307,6 +315,21 @@ def _kind_of(box: Box) -> str:
     known = f"periodic={box.periodic}" if box.flags is None else "periodic per system"
     many = f", for each of {box.vectors.shape[0]} systems" if box.per_system else ""
     return f"{known}, {'lengths' if box.orthogonal else 'matrix'}{', fractional' * box.fractional}{many}"
+
+
+def check_values(name: str, values: Tree, size: int, what: str, more: str = "") -> Tree:
+    """Return a pytree of arrays with so many rows each; a TypeError or ValueError names the one that is none, and says `more`."""
+
+    def check(path: KeyPath, leaf: Given) -> Given:
+        full = f"{name}{jax.tree_util.keystr(path)}"
+        leaf = as_array(full, leaf)
+        if not hasattr(leaf, "shape") or not hasattr(leaf, "dtype"):
+            raise TypeError(f"{full} must be an array with a row per {what}, got {type(leaf).__name__}.")
+        if tuple(leaf.shape[:1]) != (size,):
+            raise ValueError(f"{full} must have shape [{size}, ...], one row per {what}, got {list(leaf.shape)}{more}.")
+        return leaf
+
+    return jax.tree_util.tree_map_with_path(check, values)
 
 
 def check_flag(name: str, value: object) -> bool:

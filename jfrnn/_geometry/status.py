@@ -180,13 +180,8 @@ def mark_rows(x: Array, good: Array) -> Array:
     `good` [rows] says it of each row, or [] of all.
     """
     if jnp.issubdtype(x.dtype, jnp.floating):
-        return x * one_or_nan(good, x)
+        return x * _spread(jnp.where(good, 1, jnp.nan).astype(x.dtype), x.ndim)
     return jnp.where(_spread(good, x.ndim), x, jnp.iinfo(x.dtype).min)
-
-
-def one_or_nan(good: Array, like: Array | jax.ShapeDtypeStruct) -> Array:
-    """Return 1 for good rows and NaN for others, in a shape that multiplies `like` [rows, ...]."""
-    return _spread(jnp.where(good, 1, jnp.nan).astype(like.dtype), like.ndim)
 
 
 def _spread(good: Array, ndim: int) -> Array:

@@ -102,10 +102,9 @@ class KeptSearch(KeptOptions):
             raise ValueError(f"{status.message} At present it holds {self._pairs_held()}.")
         verlet, problem, more = self.verlet, self.problem, ""
         if verlet is not None and verlet.positions.ndim == 2:
-            kept = (verlet.positions, verlet.queries, None, verlet.box, verlet.radii or self.radii, self.batch, self.exclude)
-            more = name_culprits(
-                status & ~(geometry.Status.NONFINITE if self.masked else geometry.Status.OK), problem.inputs(*kept)
-            )
+            cutoff = problem.listed_within(verlet.radii or self.radii)
+            kept = Inputs(verlet.positions, verlet.queries, None, verlet.box, cutoff, self.batch, self.exclude)
+            more = name_culprits(status & ~(geometry.Status.NONFINITE if self.masked else geometry.Status.OK), kept)
         geometry.refuse_status(status, self.box, self.box_kind, problem.reach(self.radii), more)
 
     def _mark(self, x: Array) -> Array:
@@ -192,7 +191,7 @@ class KeptSearch(KeptOptions):
         with own_transfers():
             return call_apart(_update, self, sources, rows, active, None if box is None else now, radii)
 
-    def grow(
+    def grow(  # noqa: D417 (three arguments share a line)
         self,
         positions: Points,
         box: geometry.Box | None = None,
@@ -210,9 +209,7 @@ class KeptSearch(KeptOptions):
         Args:
             positions: Sources [length], shape [n, d].
             box: The box at these positions; default: that of the list, which after a chunk is the last one.
-            cutoff: As in `update`.
-            queries: As in `update`.
-            active: As in `update`.
+            cutoff, queries, active: As in `update`.
             slack: Factor >= 1 on what was needed so far, including updates of this list.
 
         Returns:
@@ -237,7 +234,7 @@ class KeptSearch(KeptOptions):
         wider = _replace(self, problem=dataclasses.replace(self.problem, options=options), box_numbers=None)
         if box is not None and images is not None:
             box = geometry.box_of_list(box, images, reach)
-        inputs = self.problem.inputs(sources, rows, active, box, radii, self.batch, self.exclude)
+        inputs = Inputs(sources, rows, active, box, self.problem.listed_within(radii), self.batch, self.exclude)
         with own_transfers():
             met = self._round_room(math.ceil(slack * int(np.max(np.asarray(self.required)))))
             made = _remake(wider, inputs, max(self._room, met, self._count_room(inputs, options, slack)))
@@ -282,14 +279,12 @@ class KeptSearch(KeptOptions):
     ) -> tuple[Array, Array, geometry.Box | None]:
         """Return the present positions of sources and rows, as lengths, and the present box, after checking that they fit."""
         problem, rows = self.problem, None
-        sources = geometry.check_again("positions", positions, problem.dtype, problem.dim, problem.source_count)
-        geometry.check_devices("positions", sources, self.status)
+        sources = geometry.check_again("positions", positions, problem.dtype, problem.dim, problem.source_count, self.status)
         if problem.own_queries != (queries is not None):
             state = "with queries: pass queries=" if problem.own_queries else "without queries: leave queries out"
             raise ValueError(f"this list was made {state}.")
         if queries is not None:
-            rows = geometry.check_again("queries", queries, problem.dtype, problem.dim, self._row_count)
-            geometry.check_devices("queries", rows, self.status)
+            rows = geometry.check_again("queries", queries, problem.dtype, problem.dim, self._row_count, self.status)
         if box is None:
             box = self.box
         elif self.box is None:
@@ -312,7 +307,7 @@ def _update(
     """Make a list anew if it is stale; without a box, in its own."""
     stays, box = box is None, nbrs.box if box is None else box
     sources, queries, box, radii = lax.stop_gradient((sources, queries, box, radii))
-    inputs = nbrs.problem.inputs(sources, queries, active, box, radii, nbrs.batch, nbrs.exclude)
+    inputs = Inputs(sources, queries, active, box, nbrs.problem.listed_within(radii), nbrs.batch, nbrs.exclude)
     if nbrs.verlet is None:
         return _make_again(nbrs, inputs)
     if not stays and nbrs.box_numbers is not None:

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jax import Array, lax
+from jax import lax
 from jax.core import Tracer
 
 from jfrnn import _engine as engine
@@ -62,23 +62,12 @@ class Problem:
         largest = self.cutoff if radii is None else geometry.largest_known(radii)
         return None if largest is None else list_radius(largest, self.skin, self.dtype)
 
-    def inputs(
-        self,
-        sources: Array,
-        queries: Array | None,
-        active: Array | None,
-        box: geometry.Box | None,
-        radii: geometry.Radii | None,
-        batch: geometry.Batch | None,
-        exclude: geometry.Exclusions | None,
-    ) -> engine.Inputs:
-        """Return the operands of this search for these particles."""
+    def listed_within(self, radii: geometry.Radii | None) -> geometry.Cutoff | geometry.Radii:
+        """Return the cutoff of the list, skin included, as engines are given it; or cutoffs per particle."""
         if radii is not None:
-            return engine.Inputs(sources, queries, active, box, radii, batch, exclude)
+            return radii
         assert self.cutoff is not None  # without radii there is one
-        reach = list_radius(self.cutoff, self.skin, self.dtype)
-        cutoff = geometry.make_cutoff(reach, self.dtype, self.options.closed)
-        return engine.Inputs(sources, queries, active, box, cutoff, batch, exclude)
+        return geometry.make_cutoff(list_radius(self.cutoff, self.skin, self.dtype), self.dtype, self.options.closed)
 
     def refuse(self, status: geometry.Status | None, inputs: engine.Inputs) -> None:
         """Raise what bits report of a search of concrete particles, if any is set; None: they are not known.
@@ -217,7 +206,7 @@ def check_problem(asked: Asked) -> tuple["Problem", engine.Inputs]:
     shape = {"own_queries": queries is not None, "masked": active is not None, "source_count": sources.shape[0]}
     problem = Problem(options, radius, skin, **shape, dim=sources.shape[1], dtype=dtype)
     box = None if box is None or images is None else geometry.box_of_list(geometry.round_box(box, dtype), images, reach)
-    return problem, problem.inputs(sources, queries, active, box, radii, systems, excluded)
+    return problem, engine.Inputs(sources, queries, active, box, problem.listed_within(radii), systems, excluded)
 
 
 # --- its search -----------------------------------------------------------------------------------------------------------

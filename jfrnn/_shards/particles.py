@@ -17,7 +17,7 @@ from jax import Array, lax
 from jax.core import Tracer
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
-from jfrnn._geometry import Box, Status, check_again, names_of_bits, shape_of
+from jfrnn._geometry import Box, Status, check_again, check_values, names_of_bits, shape_of
 from jfrnn._tracing import Given, Tree
 
 OVERFLOWS = Status.ROW_OVERFLOW | Status.SHARD_OVERFLOW | Status.HALO_OVERFLOW | Status.HALO_TOO_FAR
@@ -136,11 +136,8 @@ class Particles:
         """
         rows, dim = self.positions.shape
         if positions is not None:
-            positions = check_again("positions", positions, np.dtype(self.positions.dtype), dim, rows, "this")
-        for path, leaf in jax.tree_util.tree_leaves_with_path(values):
-            if tuple(np.shape(leaf)[:1]) != (rows,):
-                name = f"values{jax.tree_util.keystr(path)}"
-                raise ValueError(f"{name} must have shape [{rows}, ...], a row per row of particles, got {list(np.shape(leaf))}.")
+            positions = check_again("positions", positions, np.dtype(self.positions.dtype), dim, rows, None, "this")
+        check_values("values", values, rows, "row of particles")
         changed = {name: value for name, value in (("positions", positions), ("values", values)) if value is not None}
         return dataclasses.replace(self, **changed)
 

@@ -9,13 +9,12 @@ import numpy as np
 from jax import Array
 from jax.core import Tracer
 from jax.sharding import Mesh
-from jax.tree_util import KeyPath
 
-from jfrnn._geometry import Box, check_box, check_cutoff, check_positions, check_skin, check_slack, images_of
+from jfrnn._geometry import Box, check_box, check_cutoff, check_positions, check_skin, check_slack, check_values, images_of
 from jfrnn._search import list_radius
 from jfrnn._shards.migrate import migrate
 from jfrnn._shards.particles import Particles, Sizes, no_requirements, place_rows, replicate, resize, room
-from jfrnn._tracing import Given, Number, Points, Real, Tree, as_array
+from jfrnn._tracing import Number, Points, Real, Tree, as_array
 
 _MOST = 2**31 - 1
 _SMALL = 1024  # particles per message for which the first guess leaves room: a wrong guess costs a compilation
@@ -60,7 +59,7 @@ def scatter(
     x = np.asarray(positions)
     if len(x) > _MOST:
         raise ValueError(f"positions hold {len(x)} particles, but ids are int32: at most {_MOST}.")
-    values = jax.tree_util.tree_map_with_path(lambda path, leaf: _check_value(path, leaf, len(x)), values)
+    values = jax.tree.map(np.asarray, check_values("values", values, len(x), "particle"))
     slack, radius = check_slack(slack), check_cutoff(cutoff, x.dtype)
     reach = list_radius(radius, check_skin(skin, radius, x.dtype), x.dtype)
     mesh, cut = _check_mesh(mesh, x.shape[1]), _check_along(along, x, mesh)
@@ -120,16 +119,6 @@ def fetch(array: Array) -> np.ndarray:
     from jax.experimental import multihost_utils
 
     return np.asarray(multihost_utils.process_allgather(array, tiled=True))
-
-
-def _check_value(path: KeyPath, leaf: Given, total: int) -> np.ndarray:
-    name = f"values{jax.tree_util.keystr(path)}"
-    leaf = as_array(name, leaf)
-    if not hasattr(leaf, "shape") or not hasattr(leaf, "dtype"):
-        raise TypeError(f"{name} must be an array with a row per particle, got {type(leaf).__name__}.")
-    if tuple(leaf.shape[:1]) != (total,):
-        raise ValueError(f"{name} must have shape [{total}, ...], one row per particle, got {list(leaf.shape)}.")
-    return np.asarray(leaf)
 
 
 def _check_mesh(mesh: object, dim: int) -> Mesh:

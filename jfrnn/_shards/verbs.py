@@ -7,12 +7,11 @@ from collections.abc import Callable
 from typing import Any, Literal
 
 import jax
-import jax.numpy as jnp
 from jax import Array
 from jax.core import Tracer
 
 from jfrnn._engine import parse_backend
-from jfrnn._geometry import ROWS_ARE_WHOLE, Status, check_capacity, check_flag, check_slack, known_status, mark_rows
+from jfrnn._geometry import ROWS_ARE_WHOLE, Status, check_capacity, check_flag, check_slack, check_values, known_status, mark_rows
 from jfrnn._search import NeighborList
 from jfrnn._shards.calls import (
     BACKENDS,
@@ -32,7 +31,7 @@ from jfrnn._sums import pair_sum as pair_sum_on_one
 from jfrnn._tracing import Flag, Number, Real, Size, Tree
 
 
-def search(
+def search(  # noqa: D417 (five arguments share a line)
     particles: Particles,
     cutoff: Number,
     *,
@@ -48,11 +47,7 @@ def search(
     Args:
         particles: Distributed particles.
         cutoff: Interaction radius [length], a static number > 0; with the skin at most the reach of the particles.
-        skin: As in `jfrnn.search`.
-        include_self: As in `jfrnn.search`.
-        closed: As in `jfrnn.search`.
-        capacity: As in `jfrnn.search`.
-        slack: As in `jfrnn.search`.
+        skin, include_self, closed, capacity, slack: As in `jfrnn.search`.
         backend: "warp", "jax", "brute" or "auto", as in `jfrnn.search`.
 
     Returns:
@@ -74,7 +69,7 @@ def search(
     return list_on_shards(particles, asked, check_capacity(capacity))
 
 
-def count(
+def count(  # noqa: D417 (four arguments share a line)
     particles: Particles,
     cutoff: Number,
     *,
@@ -87,10 +82,7 @@ def count(
 
     Args:
         particles: Distributed particles.
-        cutoff: As in `search`.
-        include_self: As in `search`.
-        closed: As in `search`.
-        backend: As in `search`.
+        cutoff, include_self, closed, backend: As in `search`.
         halo: A halo at these positions; by default one is made.
 
     Returns:
@@ -107,7 +99,7 @@ def count(
     return counts(particles, halo, check_asked(particles, cutoff, 0.0, include_self, closed, backend))
 
 
-def pair_sum(
+def pair_sum(  # noqa: D417 (three arguments share a line, and two another)
     fn: Callable[[Array, Any, Any], Any],
     particles: Particles,
     cutoff: Number | None,
@@ -128,11 +120,8 @@ def pair_sum(
         particles: Distributed particles; derivatives in `particles.positions` are those in the positions.
         cutoff: As in `search`; with `neighbors` None.
         values: A pytree of arrays of shape [N, ...], rows and sharding as in `particles.positions`. Default: None.
-        reduce: As in `jfrnn.pair_sum`.
-        include_self: As in `search`.
-        closed: As in `search`.
-        compensated: As in `jfrnn.pair_sum`.
-        backend: As in `search`.
+        reduce, compensated: As in `jfrnn.pair_sum`.
+        include_self, closed, backend: As in `search`.
         neighbors: A list of these particles, whose pairs and halos are used.
         halo: A halo at these positions; default: that of the list, or a new one.
 
@@ -164,10 +153,7 @@ def pair_sum(
         raise ValueError("cutoff must be given: only a list (neighbors=) has its own.")
     else:
         asked = check_asked(particles, cutoff, 0.0, include_self, closed, backend)
-    for path, leaf in jax.tree_util.tree_leaves_with_path(values):
-        if tuple(jnp.shape(leaf)[:1]) != particles.ids.shape:
-            name, shape = f"values{jax.tree_util.keystr(path)}", list(jnp.shape(leaf))
-            raise ValueError(f"{name} must have shape [{particles.ids.shape[0]}, ...], a row per row of particles, got {shape}.")
+    check_values("values", values, len(particles.ids), "row of particles")
     if halo is not None:
         check_halo(halo, particles)
     local = None if neighbors is None else neighbors.local

@@ -354,7 +354,7 @@ def _mark(leaves: list[Array], good: Array) -> list[Array]:
 
 @functools.partial(compile_program, static_argnames=("dtype",))
 def _factors(good: Array, dtype: np.dtype) -> Array:
-    return geometry.one_or_nan(good, jax.ShapeDtypeStruct(good.shape, dtype))
+    return jnp.where(good, 1, jnp.nan).astype(dtype)
 
 
 @compile_program

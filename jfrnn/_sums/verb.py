@@ -6,23 +6,20 @@ from typing import Any, Literal, TypeVar
 
 import jax
 from jax import Array
-from jax.tree_util import KeyPath
 
 from jfrnn._engine import ARRAYS, ENGINES, Features, Inputs, Options, parse_backend, platform_of
-from jfrnn._geometry import Box, check_flag
+from jfrnn._geometry import Box, check_flag, check_values
 from jfrnn._search import Asked, EdgeList, NeighborList, check_problem
 from jfrnn._tracing import (
     AnyCutoff,
     Backend,
     Flag,
     Flags,
-    Given,
     IndexRows,
     Indices,
     Points,
     RadiusRule,
     Tree,
-    as_array,
     on_device,
     own_transfers,
 )
@@ -123,8 +120,11 @@ def pair_sum(  # noqa: D417 (nine arguments share a line)
         )
     if queries is None and query_values is not None:
         raise ValueError("query_values belong to queries: without them fn gets values of i and of j.")
-    theirs = _check_values("values", values, pairs.sources.shape[0], "particle")
-    mine = theirs if queries is None else _check_values("query_values", query_values, pairs.rows.shape[0], "query")
+    shared = ": what all pairs share fn may close over"
+    theirs = jax.tree.map(on_device, check_values("values", values, len(pairs.sources), "particle", shared))
+    mine = theirs
+    if queries is not None:
+        mine = jax.tree.map(on_device, check_values("query_values", query_values, len(pairs.rows), "query", shared))
     with own_transfers():
         return reduce_pairs(fn, pairs, mine, theirs, reduce, symmetry, compensated)
 
@@ -141,20 +141,3 @@ def _with_engine(options: Options, inputs: Inputs, may_change: bool) -> Options:
     if reason is not None and not may_change:
         raise ValueError(f"backend='warp' cannot sum over pairs {reason}: pass backend='jax'.")
     return options._replace(may_change=may_change) if reason is None else options._replace(engine=ARRAYS)
-
-
-def _check_values(name: str, values: Tree, size: int, what: str) -> Tree:
-    def check_leaf(path: KeyPath, leaf: Given) -> Array:
-        leaf = as_array(f"{name}{jax.tree_util.keystr(path)}", leaf)
-        if not hasattr(leaf, "shape") or not hasattr(leaf, "dtype"):
-            raise TypeError(
-                f"{name}{jax.tree_util.keystr(path)} must be an array with a row per {what}, got {type(leaf).__name__}."
-            )
-        if tuple(leaf.shape[:1]) != (size,):
-            raise ValueError(
-                f"{name}{jax.tree_util.keystr(path)} must have shape [{size}, ...], one row per {what}, got {list(leaf.shape)}: "
-                "what all pairs share fn may close over."
-            )
-        return on_device(leaf)
-
-    return jax.tree_util.tree_map_with_path(check_leaf, values)

@@ -85,8 +85,7 @@ def largest_of(x: Array) -> Array:
     return lax.max(*twice)
 
 
-def first_set(flags: Array, after: Array) -> Array:
-    """Return the first index after another one at which flags [n] are set, or n: [] int32."""
-    places = lax.iota(jnp.int32, len(flags) + 1)
-    there = jnp.concatenate([flags, jnp.ones(1, bool)]) & (places > after)
+def first_set(flags: Array) -> Array:
+    """Return the first index at which flags [n] are set, or n: [] int32."""
+    there = jnp.concatenate([flags, jnp.ones(1, bool)])
     return lax.argmax(there, 0, jnp.int32)  # one kernel; a minimum of indices would be a chain of them

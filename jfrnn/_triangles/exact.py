@@ -174,7 +174,7 @@ def _decide(
         found = test(asked, origin, count).astype(jnp.int32)
         fits = width <= limb_bits(np.dtype(asked.points.dtype)) * count
         state = state.at[at].set(jnp.where(fits, found, _WIDE), mode="drop")
-        return state, first_set(state == waiting, jnp.int32(-1))
+        return state, first_set(state == waiting)
 
-    start = state, first_set(state == waiting, jnp.int32(-1))
+    start = state, first_set(state == waiting)
     return lax.while_loop(lambda carried: carried[1] < size, decide_chunk, start)[0]

@@ -326,13 +326,10 @@ class TriangleList:
 
     def _check_points(self, positions: Points, vertices: Points | None) -> tuple[Array, Array]:
         dtype, (count, dim) = np.dtype(self.vertices.dtype), self.vertices.shape
-        points = geometry.check_again("positions", positions, dtype, dim, self.idx.shape[0])
-        geometry.check_devices("positions", points, self.idx)
+        points = geometry.check_again("positions", positions, dtype, dim, self.idx.shape[0], self.idx)
         if vertices is None:
             return points, self.vertices
-        corners = geometry.check_again("vertices", vertices, dtype, dim, count)
-        geometry.check_devices("vertices", corners, self.idx)
-        return points, corners
+        return points, geometry.check_again("vertices", vertices, dtype, dim, count, self.idx)
 
 
 @compile_program

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import jfrnn
+from jfrnn._engine import Inputs
 from jfrnn._search import kept_search
 
 pytestmark = pytest.mark.skipif(jax.default_backend() != "cpu", reason="the kernel is one of the CPU")
@@ -23,7 +24,7 @@ def a_list(x, periodic, **options):
 
 def answers(nbrs, x):
     """Return what the kernel says, and what array programs do."""
-    inputs = nbrs.problem.inputs(jnp.asarray(x), None, None, nbrs.box, None, nbrs.batch, nbrs.exclude)
+    inputs = Inputs(jnp.asarray(x), None, None, nbrs.box, nbrs.problem.listed_within(None), nbrs.batch, nbrs.exclude)
     return [bool(jax.jit(says)(nbrs, inputs)) for says in (kept_search._kernel_says_so, kept_search._has_moved_too_far)]
 
 

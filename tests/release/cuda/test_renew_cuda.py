@@ -12,7 +12,7 @@ import pytest
 
 import jfrnn
 from jfrnn._engine.operands import pack_particles
-from jfrnn._engine.problem import prepare_search
+from jfrnn._engine.problem import Inputs, prepare_search
 from jfrnn._engine.renew_warp import constants_of, numbers_of_box
 from jfrnn._geometry import Status, make_cutoff
 from jfrnn._search import neighbor_list
@@ -47,7 +47,7 @@ class OneThread:
         self.kernels = {name: self._on_the_cpu(kernel) for name, kernel in zip(kernels._fields, kernels, strict=True)}
         self.box = jfrnn.Box(np.full(dim, LENGTH, dtype)) if boxed else None
         made = jfrnn.search(jnp.asarray(now), CUTOFF, skin=SKIN, box=self.box, backend="jax", capacity=8)
-        self.inputs = made.problem.inputs(jnp.asarray(now), None, None, made.box, None, None, None)
+        self.inputs = Inputs(jnp.asarray(now), None, None, made.box, made.problem.listed_within(None))
         self.options = made.problem.options
         numbers = np.zeros((1, 1), dtype) if not boxed else np.array(numbers_of_box(self.inputs, self.options))
         half = make_cutoff(SKIN / 2, np.dtype(dtype), closed=False)
