@@ -123,7 +123,7 @@ class Box:
                 object.__setattr__(self, "numbers", short_vectors(np.asarray(vectors, np.float64), known))
 
     @classmethod
-    def from_parameters(
+    def from_parameters(  # noqa: D417 (four arguments share a line)
         cls,
         lengths: Given,
         angles: Given,
@@ -140,10 +140,7 @@ class Box:
         Args:
             lengths: Of the vectors a, b and c [length], shape [3]; in 2D a and b, shape [2].
             angles: Between b and c, a and c, a and b [degree], shape [3]; in 2D between a and b, a number. 90 makes an exact 0.
-            periodic: As in `Box`, and so are origin, images and fractional.
-            origin: As in `Box`.
-            images: As in `Box`.
-            fractional: As in `Box`.
+            periodic, origin, images, fractional: As in `Box`.
 
         Returns:
             A `Box` with lattice vectors [d, d], lower triangular.

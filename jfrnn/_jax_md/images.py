@@ -41,7 +41,7 @@ class NeighborListMultiImage(custom_partition.NeighborListMultiImage):
     kept: Kept
 
 
-def neighbor_list_multi_image(
+def neighbor_list_multi_image(  # noqa: D417 (four arguments share a line)
     displacement_or_metric: Given,
     box: Given,
     r_cutoff: Given,
@@ -58,11 +58,8 @@ def neighbor_list_multi_image(
     Args:
         displacement_or_metric: Not used.
         box: A matrix [d, d] whose columns are the lattice vectors [length], or edge lengths.
-        r_cutoff: As in `neighbor_list`, and dr_threshold, capacity_multiplier and fractional_coordinates likewise.
-        dr_threshold: As in `neighbor_list`.
-        capacity_multiplier: As in `neighbor_list`.
+        r_cutoff, dr_threshold, capacity_multiplier, fractional_coordinates: As in `neighbor_list`.
         pbc: Which axes are periodic, [d] bools; default: all.
-        fractional_coordinates: As in `neighbor_list`.
         ordered: As `format=OrderedSparse`.
         format: `Dense`, `Sparse` or `OrderedSparse`.
         **kwargs: Not used, as in jax-md.

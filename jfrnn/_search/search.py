@@ -108,7 +108,7 @@ def search(
         return dataclasses.replace(nbrs, box_numbers=nbrs._find_box_numbers(inputs)) if problem.skin > 0 else nbrs
 
 
-def search_edges(
+def search_edges(  # noqa: D417 (ten arguments share a line)
     positions: Points,
     cutoff: AnyCutoff,
     *,
@@ -133,24 +133,15 @@ def search_edges(
     These are the pairs of `search`, in memory that follows their number, not the longest row times the number of rows.
 
     Args:
-        positions: As in `search`.
-        cutoff: As in `search`.
+        positions, cutoff, batch, radius_rule, species, half, include_self, closed, active, backend: As in `search`.
         total: Number of edges that there is room for, a static int up to 2³¹ - 1. Required if positions are traced. Default:
             `slack` times as many as there are pairs, rounded up by 6 % at most.
         queries: As in `search`; the receivers are then queries.
         box: As in `search`. Each image of a neighbor has an edge of its own.
-        batch: As in `search`.
-        radius_rule: As in `search`.
-        species: As in `search`.
         exclude: As in `search`; `total` knows nothing of excluded pairs.
-        half: As in `search`.
-        include_self: As in `search`.
-        closed: As in `search`.
         skin: As in `search`: the list holds pairs within cutoff + skin, of which `EdgeList.edges` masks those beyond the cutoff.
-        active: As in `search`.
         slack: Factor >= 1 on the counted total, room for later motion.
         reverse: Keep the edges in the order of their senders, so that derivatives need not sort them in each call.
-        backend: As in `search`.
 
     Returns:
         An `EdgeList`; `status` tells of overflow and of coordinates that are not finite.
