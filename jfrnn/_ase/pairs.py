@@ -115,8 +115,7 @@ def primitive_neighbor_list(
     Raises:
         TypeError, ValueError: as `neighbor_list`.
     """
-    wrong = not isinstance(quantities, str) or not quantities or set(quantities) - set("ijdDS")
-    if wrong:
+    if not isinstance(quantities, str) or not quantities or set(quantities) - set("ijdDS"):
         raise ValueError(f"quantities must be letters of 'ijdDS', as in 'ijS', got {quantities!r}.")
     x = _array("positions", positions, "real numbers of shape [n, 3]")
     vectors = _array("cell", cell, "real numbers of shape [3, 3]")

@@ -53,7 +53,9 @@ def sort_into_boxes(
     n, (systems, dim) = len(sources), lattice.origin.shape
     packed = wrapped.turns if queries is None else wrapped.query_turns
     there, of_source = wrapped.turns >= 0, batch.sources
-    members = _count_members(of_source, there, systems)
+    counter = lax.iota(jnp.int32, n) % _COUNTERS * systems + of_source  # those of one system would wait for a single one
+    members = jnp.zeros(_COUNTERS * systems, jnp.int32).at[counter].add(there.astype(jnp.int32))
+    members = jnp.sum(members.reshape(_COUNTERS, systems), axis=0, dtype=jnp.int32)
     periodic = jnp.broadcast_to(lattice.spread(jnp.asarray(lattice.periodic), 2), (systems, dim))
     counts = _count_cells(wrapped.reach, members, periodic) if divided else jnp.ones((systems, dim), jnp.int32)
     totals = jnp.prod(counts, axis=1, dtype=jnp.int32)
@@ -61,7 +63,10 @@ def sort_into_boxes(
     first, size = ends - totals, most_cells(n, systems)
     at = _cells_along(sources, wrapped.turns, of_source, lattice, wrapped.reach, counts, periodic)
     at = jnp.where(periodic[of_source], jnp.clip(at, 0, counts[of_source] - 1), at % counts[of_source])
-    number = first[of_source] + _row_major(at, counts[of_source])
+    number = at[:, -1]
+    for axis in range(dim - 2, -1, -1):
+        number = number * counts[of_source, axis] + at[:, axis]
+    number = first[of_source] + number
     key = jnp.where(there, number, size)
     key = key.astype(jnp.uint16 if size < 2**16 - 1 else jnp.uint32)  # half as many bits are sorted in half as many passes
     _, order = lax.sort((key, lax.iota(jnp.int32, n)), num_keys=1, is_stable=True)
@@ -84,13 +89,6 @@ def sort_into_boxes(
 def most_cells(sources: int, systems: int) -> int:
     """Return how many cells so many systems have at most."""
     return sources // _FILL + systems
-
-
-def _count_members(systems: Array, there: Array, size: int) -> Array:
-    """Count the particles of each system, [size] int32: in several counters each, since those of one would wait for each other."""
-    counter = lax.iota(jnp.int32, len(systems)) % _COUNTERS
-    counted = jnp.zeros(_COUNTERS * size, jnp.int32).at[counter * size + systems].add(there.astype(jnp.int32))
-    return jnp.sum(counted.reshape(_COUNTERS, size), axis=0, dtype=jnp.int32)
 
 
 def _count_cells(reach: Array, members: Array, periodic: Array) -> Array:
@@ -124,13 +122,6 @@ def _cells_along(
     x = x if off is None else x + off
     cells = jnp.floor(jnp.where(turning, x * counts[systems].astype(x.dtype), x / reach[systems]))
     return jnp.clip(jnp.where(jnp.isfinite(cells), cells, 0), -_FARTHEST, _FARTHEST).astype(jnp.int32)
-
-
-def _row_major(cell: Array, counts: Array) -> Array:
-    number = cell[:, -1]
-    for axis in range(cell.shape[1] - 2, -1, -1):
-        number = number * counts[:, axis] + cell[:, axis]
-    return number
 
 
 def box_runs(

@@ -237,28 +237,23 @@ def widen(cutoff: Cutoff, slack: Array) -> Cutoff:
 def step_one_bounds(
     cutoff: "Cutoff | Cutoffs", radii: list[Array] | None, slack: Array | None = None
 ) -> tuple[np.floating | Array, np.floating | Array]:
-    """Return the inner and outer bound of step 1, for one cutoff or per pair; `slack` bounds the error of each component."""
-    if isinstance(cutoff, Cutoffs):
-        return _bounds_of_pairs(cutoff, radii or [], slack)
-    if slack is not None:
-        cutoff = widen(cutoff, slack)
-    return cutoff.inside, cutoff.outside
+    """Return the bounds of step 1, for one cutoff or per pair: squared distances below the first are pairs, above the second not.
 
-
-def _bounds_of_pairs(cutoffs: Cutoffs, radii: list[Array], slack: Array | None = None) -> tuple[Array, Array]:
-    """Return per-pair bounds of step 1: squared distances below the first are pairs, above the second are not.
-
-    The band is 32 eps instead of 8 because a mean and its halves are rounded. If a cutoff is so much smaller than the largest that
-    its square could underflow, only distances that are certainly larger are decided here.
+    `slack` bounds the error of each component. Of cutoffs per pair the band is 32 eps instead of 8 because a mean and its halves
+    are rounded. If one is so much smaller than the largest that its square could underflow, only distances that are certainly
+    larger are decided here.
     """
-    finfo = jnp.finfo(cutoffs.largest.dtype)
-    scaled = [radius * cutoffs.unit_scale for radius in radii]
+    if isinstance(cutoff, Cutoff):
+        cutoff = cutoff if slack is None else widen(cutoff, slack)
+        return cutoff.inside, cutoff.outside
+    finfo = jnp.finfo(cutoff.largest.dtype)
+    scaled = [radius * cutoff.unit_scale for radius in radii or []]
     radius = scaled[0] if len(scaled) == 1 else (scaled[0] + scaled[1]) / 2
-    off = 0 if slack is None else 2 * slack * cutoffs.unit_scale
+    off = 0 if slack is None else 2 * slack * cutoff.unit_scale
     least = 2.0 ** (finfo.minexp // 2 + finfo.nmant)
     sure = radius > jnp.maximum(off, least)
     inside = jnp.where(sure, (radius - off) ** 2 * (1 - 32 * finfo.eps), -1)
     outside = (jnp.maximum(radius, least) + off) ** 2 * (1 + 32 * finfo.eps)
-    if cutoffs.kinds is not None:
+    if cutoff.kinds is not None:
         outside = jnp.where(radius > 0, outside, -1)
     return inside, outside

@@ -109,19 +109,16 @@ def _make_rows(xp: _ArrayModule, pairs: Given, sources: int, queries: int | None
     used = _exist(pairs, rows, sources)
     valid = (used | _pad(pairs)).all()
     first, second = (xp.where(used, x, 0).astype(np.int32) for x in (pairs[:, 0], pairs[:, 1]))
-    shifts = None if pairs.shape[1] == 2 else _narrow(xp, pairs[:, 2:])
+    shifts, kind = None, pairs.dtype
+    if pairs.shape[1] > 2:  # a shift that does not fit into int32 belongs to an image too far away to be a neighbor
+        most = min(np.iinfo(np.int32).max // 4, np.iinfo(kind).max)
+        shifts = xp.clip(pairs[:, 2:], 0 if kind.kind == "u" else -most, most).astype(np.int32)
     if queries is None:
         used, first, second = (xp.concatenate(x) for x in ((used, used), (first, second), (second, first)))
         both = None if shifts is None else xp.concatenate([shifts, -shifts])
         return Exclusions(_sort_rows(xp, used, first, second, both, rows), None, valid)
     turned = _sort_rows(xp, used, second, first, None if shifts is None else -shifts, sources)
     return Exclusions(_sort_rows(xp, used, first, second, shifts, rows), turned, valid)
-
-
-def _narrow(xp: _ArrayModule, shifts: Given) -> Given:
-    """Return shifts as int32; one that does not fit belongs to an image too far away to be a neighbor."""
-    most = min(np.iinfo(np.int32).max // 4, np.iinfo(shifts.dtype).max)
-    return xp.clip(shifts, 0 if shifts.dtype.kind == "u" else -most, most).astype(np.int32)
 
 
 def _sort_rows(xp: _ArrayModule, used: Given, rows: Given, others: Given, shifts: Given, count: int) -> ExcludedRows:

@@ -170,17 +170,12 @@ def grow_images(kind: Images, boxes: Sequence[Box], radius: float | None, dtype:
     for box in boxes:
         check_box_values(box)
     kinds = [kind, *(images_of(box, radius, dtype, sources) for box in boxes)]
-    if len({k.basis for k in kinds}) > 1:  # reaches are comparable in one basis only: that of the last box
-        kinds = [_in_basis(box, radius, dtype, kinds[-1]) for box in boxes]
+    if len({k.basis for k in kinds}) > 1 and radius is not None:  # reaches are comparable in one basis only: that of the last box
+        basis, numbers = kinds[-1].basis, kinds[-1].numbers
+        short_of = ((box, numbers @ np.asarray(box.vectors, dtype).astype(np.float64)) for box in boxes)
+        kinds = [_needed_images(vectors, box, radius, dtype, basis) for box, vectors in short_of]
         kind = Images(kind.periodic, kind.orthogonal, kinds[-1].reach, kinds[-1].nearest, kinds[-1].basis)
     reach, nearest = tuple(map(max, *(k.reach for k in kinds), kind.reach)), all(k.nearest for k in kinds)
     if short and (reach, nearest) == (kind.reach, kind.nearest):
         reach, nearest = reach if nearest else tuple(2 * k for k in reach), False
     return check_images(kind._replace(reach=reach, nearest=nearest), sources)
-
-
-def _in_basis(box: Box, radius: float | None, dtype: np.dtype, like: Images) -> Images:
-    if radius is None:
-        return like
-    vectors = np.asarray(box.vectors, dtype).astype(np.float64)
-    return _needed_images(like.numbers @ vectors, box, radius, dtype, like.basis)

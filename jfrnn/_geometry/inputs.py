@@ -176,9 +176,13 @@ def check_species(cutoff: Given, species: Given, rule: object, sources: Array, q
             f"species must be a pair of arrays, of the positions [{n}] and of the queries [{m}], got {_describe_array(species)}."
         )
     table = check_table(cutoff, sources)
-    if not masked:
-        for name, given in (("species", of_sources), ("species[1]", of_queries)):
-            _check_kinds(name, given, len(table))
+    for name, given in (("species", of_sources), ("species[1]", of_queries)):
+        if masked or isinstance(given, Tracer):  # a status bit tells of species that are not in the table
+            continue
+        known: Any = np.asarray(jax.device_get(given))
+        wrong = known[(known < 0) | (known >= len(table))]
+        if wrong.size:
+            raise ValueError(f"{name} must be numbers of species from 0 to {len(table) - 1}, the rows of cutoff, got {wrong[0]}.")
     return Radii(of_sources, of_queries, TABLE, table=table)
 
 
@@ -209,16 +213,6 @@ def check_table(cutoff: Given, like: Array, kinds: int | None = None) -> Array:
             f"got {known[a, b]} for species {a} and {b}, and {known[b, a]} for {b} and {a}."
         )
     return table
-
-
-def _check_kinds(name: str, species: Array, kinds: int) -> None:
-    """Raise if a species is not in the table; of traced ones a status bit tells."""
-    if isinstance(species, Tracer):
-        return
-    known: Any = np.asarray(jax.device_get(species))
-    wrong = known[(known < 0) | (known >= kinds)]
-    if wrong.size:
-        raise ValueError(f"{name} must be numbers of species from 0 to {kinds - 1}, the rows of cutoff, got {wrong[0]}.")
 
 
 def largest_known(radii: Radii) -> float | None:

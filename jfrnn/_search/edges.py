@@ -148,7 +148,10 @@ def flat_edges(present: Present, status: Array, mask: Array, total: int) -> Edge
     senders = jnp.where(flat.rows < m, topology.idx.reshape(-1)[flat.slots], topology.sources)
     of_slots = topology.with_reverse()
     by_sender = of_slots._replace(slots=flat.edges.at[of_slots.slots].get(mode="fill", fill_value=total))
-    by_row = _by_row(flat.offsets, capacity, total, topology.native)
+    by_row = edges_of_rows(flat.offsets, total)
+    if not topology.native:  # array programming adds rows of one length sooner
+        edge = flat.offsets[:-1, None] + lax.iota(jnp.int32, capacity)[None]
+        by_row = Reverse(jnp.where(edge < flat.offsets[1:, None], jnp.minimum(edge, total), total))
     sides = one_each(senders, topology.sources, topology.native, by_sender), one_each(flat.rows, m, topology.native, by_row)
     images = None if codes is None else codes._replace(codes=codes.codes.reshape(-1)[flat.slots]), made
     fixed = dataclasses.replace(present, topology=sides[0], count=flat.offsets[-1], images=images, cutoff=None)
@@ -238,11 +241,3 @@ def edges_of_rows(offsets: Array, total: int) -> Reverse:
     """Return the edges of each receiver of a flat list."""
     held = jnp.minimum(offsets, total)
     return Reverse(lax.iota(jnp.int32, total), held[:-1], jnp.diff(held))
-
-
-def _by_row(offsets: Array, capacity: int, total: int, native: bool) -> Reverse:
-    """Return the edges of each row, which follow each other."""
-    if native:  # array programming adds rows of one length sooner
-        return edges_of_rows(offsets, total)
-    edge = offsets[:-1, None] + lax.iota(jnp.int32, capacity)[None]
-    return Reverse(jnp.where(edge < offsets[1:, None], jnp.minimum(edge, total), total))

@@ -187,11 +187,9 @@ def _sums(
 
 # --- how processes connect, and how soon they notice that one has died ------------------------------------------------
 
-_PATIENCE = 20.0
-
 
 def connect(
-    address: str | None = None, processes: int | None = None, process: int | None = None, *, patience: float = _PATIENCE
+    address: str | None = None, processes: int | None = None, process: int | None = None, *, patience: float = 20.0
 ) -> None:
     """Connect the processes of a run, before anything else asks JAX for a device; a single process need not call this.
 

@@ -11,8 +11,8 @@ from jax import Array, lax
 from jax.custom_derivatives import SymbolicZero
 
 from jfrnn._engine import Block, Slots
-from jfrnn._sums.fused import can_sum_list, check, extremes, extremes_of_list
-from jfrnn._sums.relations import Kept, Listed, Relation, Searched, evaluate, is_fused
+from jfrnn._sums.fused import extremes, extremes_of_list
+from jfrnn._sums.relations import Kept, Listed, Relation, evaluate, is_fused, summable
 from jfrnn._sums.summation import bind_sum
 from jfrnn._sums.terms import Derived, Groups, Term, choose, fresh_labels, join, make_term
 from jfrnn._tracing import call_apart, compile_program
@@ -25,10 +25,7 @@ def bind_extremes(relation: Relation, term: Term, operands: Groups, largest: boo
 
     NaN is more extreme than any number. Of equal values, that of the smallest j is chosen, and so is its derivative.
     """
-    if isinstance(relation, Searched):
-        check(relation.inputs, relation.options, term)
-    elif isinstance(relation, Kept) and not can_sum_list(relation.given, term):
-        relation = call_apart(Kept.listed, relation)
+    relation = summable(relation, term)
     find = functools.partial(_find, term=term, largest=largest)
     found = call_apart(lambda *given: find(given[0], operands=given[1]), lax.stop_gradient(relation), lax.stop_gradient(operands))
     return _values(found, operands, term, largest, relation.sizes[1])

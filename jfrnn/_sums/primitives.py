@@ -126,10 +126,6 @@ def _slice(x: Values, params: dict[str, Any]) -> Values:
     return x[tuple(map(slice, params["start_indices"], params["limit_indices"], strides))]
 
 
-def _split(eqn: Equation, inputs: list[Values]) -> list[Values]:
-    return np.split(inputs[0], np.cumsum(eqn.params["sizes"])[:-1], eqn.params["axis"])
-
-
 def _iota(eqn: Equation, _: list[Values]) -> list[Values]:
     (shape, dtype), axis = eqn.outputs[0], eqn.params["dimension"]
     line = np.array([eqn.scalars.constant(k, dtype) for k in range(shape[axis])], int)
@@ -213,7 +209,7 @@ TABLE |= {
     "tile": _move(lambda x, params: np.tile(x, params["reps"])),
     "concatenate": lambda eqn, inputs: [np.concatenate(inputs, eqn.params["dimension"])],
     "stack": lambda eqn, inputs: [np.stack(inputs, eqn.params["axis"])],
-    "split": _split,
+    "split": lambda eqn, inputs: np.split(inputs[0], np.cumsum(eqn.params["sizes"])[:-1], eqn.params["axis"]),
     "unstack": lambda eqn, inputs: list(np.moveaxis(inputs[0], eqn.params["axis"], 0)),
     "iota": _iota,
     "pad": _pad,

@@ -11,11 +11,11 @@ from jax import Array, lax
 from jfrnn._engine import FOLD_GROUP, Block, Inputs, KeptList, Options, Slots, Visit, fold_pairs, kept_mask
 from jfrnn._geometry import EXCHANGED, Radii, are_finite, compensated_sum, mark_rows, rounded_sum
 from jfrnn._search import Reverse, Topology, kept_shifts
+from jfrnn._sums.fused import can_sum_list, check, sums_of_list
 from jfrnn._sums.fused import is_fused as is_fusible
 from jfrnn._sums.fused import sums as fused_sums
-from jfrnn._sums.fused import sums_of_list
 from jfrnn._sums.terms import Groups, Term
-from jfrnn._tracing import Tree, largest_of
+from jfrnn._tracing import Tree, call_apart, largest_of
 
 _LIST_SLOTS = 1 << 22  # scalars of list slots that are processed at a time: 16 MB of float32
 
@@ -278,6 +278,15 @@ Relation = Searched | Listed | Flat | Kept
 def is_fused(relation: Relation, term: Term) -> TypeGuard[Searched]:
     """Say whether the fused engine sums this term over this relation."""
     return isinstance(relation, Searched) and 0 not in relation.sizes and is_fusible(relation.inputs, relation.options, term)
+
+
+def summable(relation: Relation, term: Term) -> Relation:
+    """Return the pairs in the form over which a term is summed; raise if the engine that was chosen by name cannot."""
+    if isinstance(relation, Searched):
+        check(relation.inputs, relation.options, term)
+    elif isinstance(relation, Kept) and not can_sum_list(relation.given, term):
+        return call_apart(Kept.listed, relation)  # once: derivatives are summed in the same way
+    return relation
 
 
 def sum_pairs(relation: Relation, term: Term, operands: Groups, compensated: bool) -> list[Array]:

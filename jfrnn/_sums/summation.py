@@ -18,9 +18,8 @@ from jax.interpreters import ad, batching, mlir
 
 from jfrnn import _tracing as tracing
 from jfrnn._sums.exchange import signs_of
-from jfrnn._sums.fused import can_sum_list, check
 from jfrnn._sums.joint import lower_sum
-from jfrnn._sums.relations import Kept, Relation, Searched, sum_pairs
+from jfrnn._sums.relations import Relation, sum_pairs, summable
 from jfrnn._sums.terms import Groups, Term, choose, is_moving, join, tangent, transpose
 
 Structure = Any  # the `PyTreeDef` of a relation, which type checkers do not accept as a type
@@ -38,12 +37,7 @@ def bind_sum(relation: Relation, term: Term, operands: Groups, compensated: bool
 
 def _bind(leaves: list[Array], operands: Groups, term: Term, structure: Structure, compensated: bool) -> list[Array]:
     flat = [x if isinstance(x, Array) else jnp.asarray(x) for group in operands for x in group]  # tangents may be Python numbers
-    relation = jax.tree.unflatten(structure, leaves)
-    if isinstance(relation, Searched):
-        check(relation.inputs, relation.options, term)
-    elif isinstance(relation, Kept) and not can_sum_list(relation.given, term):
-        relation = tracing.call_apart(Kept.listed, relation)  # once: derivatives are summed in the same way
-        leaves, structure = jax.tree.flatten(relation)
+    leaves, structure = jax.tree.flatten(summable(jax.tree.unflatten(structure, leaves), term))
     axes = tracing.varying_axes((leaves, flat))
     leaves, flat = tracing.vary((leaves, flat), axes)
     return _pair_sum_p.bind(*leaves, *flat, term=term, structure=structure, compensated=compensated)

@@ -124,16 +124,11 @@ def vary(tree: Tree, axes: tuple[str, ...]) -> Tree:
 
     def vary_leaf(x: Array) -> Array:
         more = tuple(name for name in axes if name not in _axes_of(jax.typeof(x)))
-        return _mark(x, more) if more else x
+        if more and hasattr(lax, "pcast"):
+            return lax.pcast(x, more, to="varying")
+        return lax.pvary(x, more) if more else x  # pyright: ignore[reportAttributeAccessIssue] (of JAX 0.8.0 and earlier)
 
     return jax.tree.map(vary_leaf, tree) if axes else tree
-
-
-def _mark(x: Array, axes: tuple[str, ...]) -> Array:
-    """Mark an array as varying over more axes, by the name that this has in JAX 0.8.0 and earlier, or in later releases."""
-    if hasattr(lax, "pcast"):
-        return lax.pcast(x, axes, to="varying")
-    return lax.pvary(x, axes)  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def result_aval(shape: tuple[int, ...], dtype: np.dtype, operands: Iterable[Aval]) -> ShapedArray:

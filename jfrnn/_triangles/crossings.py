@@ -12,13 +12,16 @@ no area. Floats decide where these signs are beyond doubt (`jfrnn._triangles.win
 Source: Möller & Trumbore (1997), doi:10.1080/10867651.1997.10487468, with the quotients multiplied out.
 """
 
+import functools
+import operator
+
 import jax.numpy as jnp
 from jax import Array, lax
 
 from jfrnn._tracing import set_places
-from jfrnn._triangles.exact import refine
+from jfrnn._triangles.exact import refine, sum_of
 from jfrnn._triangles.integers import Segments, is_crossed
-from jfrnn._triangles.winding import line_products
+from jfrnn._triangles.winding import line_products, sure_signs
 
 _CHUNK = 1 << 13  # pairs at a time
 
@@ -55,19 +58,14 @@ def are_crossed(points: Array, corners: Array, good: Array, idx: Array, used: Ar
 
 def _is_between(points: Array, ends: Array, shapes: Array, asked: Array) -> Array:
     """Say which segments [k, d] to [k, d] meet their shapes [k, corner, d], where asked: [k] bool."""
-    dim, finfo = points.shape[1], jnp.finfo(points.dtype)
+    dim = points.shape[1]
     raw, way = shapes - points[:, None], ends - points
     largest = jnp.maximum(jnp.max(jnp.abs(raw), axis=(1, 2)), jnp.max(jnp.abs(way), axis=1))
     unit = jnp.where(largest > 0, largest, 1)
     x = [[raw[:, c, k] / unit for k in range(dim)] for c in range(dim)]
-    sides, sizes, height, size = line_products(x, [way[:, k] / unit for k in range(dim)])
-    doubts, doubt = [8 * finfo.eps * d + 64 * finfo.tiny for d in sizes], 8 * finfo.eps * size + 64 * finfo.tiny
-    rest, rest_doubt = height, doubt
-    above, below, left, right = (jnp.ones_like(asked), jnp.ones_like(asked), jnp.zeros_like(asked), jnp.zeros_like(asked))
-    for side, error in zip(sides, doubts, strict=True):
-        rest, rest_doubt = rest - side, rest_doubt + error
-        above, below = above & (side > error), below & (side < -error)
-        left, right = left | (side > error), right | (side < -error)
+    sides, doubts, height, doubt = line_products(x, [way[:, k] / unit for k in range(dim)])
+    rest, rest_doubt = functools.reduce(operator.sub, sides, height), sum_of([doubt, *doubts])
+    (above, left), (below, right) = sure_signs(sides, doubts)
     surely = above & (height > doubt) & (rest < -rest_doubt) | below & (height < -doubt) & (rest > rest_doubt)
     never = left & right | (height > doubt) & (rest > rest_doubt) | (height < -doubt) & (rest < -rest_doubt)
     doubtful = asked & ~surely & ~never

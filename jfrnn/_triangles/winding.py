@@ -182,15 +182,10 @@ def _crossings(corners: Array, triangle: Array, points: Array, rays: Array) -> t
     x = [[raw[:, c, k] / unit for k in range(dim)] for c in range(dim)]
     ray = [rays[:, k] for k in range(dim)]
     sides, doubts, height, doubt = line_products(x, ray)
-    doubts, doubt = [8 * finfo.eps * d + finfo.tiny for d in doubts], 8 * finfo.eps * doubt + finfo.tiny
     behind = functools.reduce(jnp.logical_and, (dot(ray, corner) < -_BEHIND * finfo.eps for corner in x))
-    left, right, leaves, enters = jnp.zeros_like(there), jnp.zeros_like(there), height > doubt, height < -doubt
-    sure_left, sure_right = leaves, enters
-    for side, error in zip(sides, doubts, strict=True):
-        left, right = left | (side > error), right | (side < -error)
-        sure_left, sure_right = sure_left & (side > error), sure_right & (side < -error)
+    leaves, enters, (all_left, left), (all_right, right) = height > doubt, height < -doubt, *sure_signs(sides, doubts)
     may_leave, may_enter = there & ~(behind | right | enters), there & ~(behind | left | leaves)
-    sure_left, sure_right = may_leave & sure_left, may_enter & sure_right
+    sure_left, sure_right = may_leave & leaves & all_left, may_enter & enters & all_right
     least = sure_left.astype(jnp.int32) - may_enter.astype(jnp.int32)
     return least, may_leave.astype(jnp.int32) - sure_right.astype(jnp.int32)
 
@@ -198,19 +193,30 @@ def _crossings(corners: Array, triangle: Array, points: Array, rays: Array) -> t
 def line_products(x: list[Vector], ray: Vector) -> tuple[Vector, Vector, Array, Array]:
     """Return triple products of a line through the origin with each side of a shape; all have one sign if it crosses the shape.
 
-    Further results are their sums of absolute values, a number that has the same sign if the shape is ahead, and its sum of
-    absolute values.
+    Further results are bounds on their rounding errors, a number that has the same sign if the shape is ahead, and the bound on
+    its error.
     """
+    finfo = jnp.finfo(ray[0].dtype)
+
+    def bound(size: Array) -> Array:
+        return 8 * finfo.eps * size + 64 * finfo.tiny
+
     if len(x) == 2:
         flat = [ray[0] * corner[1] - ray[1] * corner[0] for corner in x]
-        sizes = [jnp.abs(ray[0] * corner[1]) + jnp.abs(ray[1] * corner[0]) for corner in x]
+        doubts = [bound(jnp.abs(ray[0] * corner[1]) + jnp.abs(ray[1] * corner[0])) for corner in x]
         size = jnp.abs(x[0][0] * x[1][1]) + jnp.abs(x[0][1] * x[1][0])
-        return [-flat[0], flat[1]], sizes, _determinant(x), size
+        return [-flat[0], flat[1]], doubts, _determinant(x), bound(size)
     sizes_of = [[jnp.abs(component) for component in corner] for corner in (*x, ray)]
     crosses = [cross(x[i], x[j]) for i, j in ((1, 2), (2, 0), (0, 1))]
     permanents = [
         [sizes_of[i][a] * sizes_of[j][b] + sizes_of[i][b] * sizes_of[j][a] for a, b in ((1, 2), (2, 0), (0, 1))]
         for i, j in ((1, 2), (2, 0), (0, 1))
     ]
-    sides, sizes = [dot(ray, c) for c in crosses], [dot(sizes_of[3], p) for p in permanents]
-    return sides, sizes, dot(x[0], crosses[0]), dot(sizes_of[0], permanents[0])
+    sides, doubts = [dot(ray, c) for c in crosses], [bound(dot(sizes_of[3], p)) for p in permanents]
+    return sides, doubts, dot(x[0], crosses[0]), bound(dot(sizes_of[0], permanents[0]))
+
+
+def sure_signs(numbers: Vector, doubts: Vector) -> list[tuple[Array, Array]]:
+    """Say whether all of the numbers, and whether any of them, are surely above 0; and likewise below."""
+    above, below = ([sign * x > doubt for x, doubt in zip(numbers, doubts, strict=True)] for sign in (1, -1))
+    return [(functools.reduce(jnp.logical_and, x), functools.reduce(jnp.logical_or, x)) for x in (above, below)]
