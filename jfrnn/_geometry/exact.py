@@ -57,20 +57,12 @@ class Pair(NamedTuple):
             return [(self.shift[:dim], jnp.stack([matrix[k, k] for k in range(dim)]))]
         return [(shift[None], vector) for shift, vector in zip(self.shift, matrix, strict=True)]
 
-    def along(self, k: int) -> "_Component":
-        """Return the components along one axis."""
+    def along(self, k: int) -> tuple[Array, Array, list[tuple[Array, Array]]]:
+        """Return the components of a and b along one axis, and shifts and lattice vectors between them."""
         if self.shift is None or self.matrix is None:
-            return _Component(self.a[k], self.b[k], [])
+            return self.a[k], self.b[k], []
         terms = [(self.shift[k], self.matrix[k, k])] if self.orthogonal else list(zip(self.shift, self.matrix[:, k], strict=True))
-        return _Component(self.a[k], self.b[k], terms)
-
-
-class _Component(NamedTuple):
-    """Components of points a and b, and shifts and lattice vectors between them, along one axis, or along all [d, ...]."""
-
-    a: Array
-    b: Array
-    terms: list[tuple[Array, Array]]
+        return self.a[k], self.b[k], terms
 
 
 PointsAt = Callable[[Array | None], Pair]
@@ -201,7 +193,7 @@ def decide_pairs(doubtful: Array, points: PointsAt, cutoff: Cutoff | Cutoffs) ->
     `points(None)` returns both points of every pair in the shape of `doubtful`, and `points(at)` those at the flat indices `at`.
     """
     pairs = points(None)
-    signs = jnp.where(doubtful, _fixed_sign(pairs, _threshold(pairs, cutoff)), 1).astype(jnp.int8)
+    signs = jnp.where(doubtful, _fixed_sign(pairs, cutoff), 1).astype(jnp.int8)
     chunk = min(_INTEGER_CHUNK, signs.size)
 
     def decide_chunk(signs: Array) -> Array:
@@ -209,7 +201,7 @@ def decide_pairs(doubtful: Array, points: PointsAt, cutoff: Cutoff | Cutoffs) ->
         first = jnp.minimum(lax.argmax(flat, 0, jnp.int32), flat.size - chunk)  # that of an unknown sign, the largest value
         here = points(first + lax.iota(jnp.int32, chunk))
         known = lax.dynamic_slice_in_dim(flat, first, chunk)
-        known = jnp.where(known == _UNKNOWN, _integer_sign(here, _threshold(here, cutoff)).astype(jnp.int8), known)
+        known = jnp.where(known == _UNKNOWN, _integer_sign(here, cutoff).astype(jnp.int8), known)
         return lax.dynamic_update_slice_in_dim(flat, known, first, axis=0).reshape(signs.shape)
 
     signs = lax.while_loop(lambda signs: largest_of(signs) == _UNKNOWN, decide_chunk, signs)
@@ -218,74 +210,60 @@ def decide_pairs(doubtful: Array, points: PointsAt, cutoff: Cutoff | Cutoffs) ->
 
 def decide_in_units(pair: Pair, cutoff: Cutoff | Cutoffs) -> tuple[Array, Array]:
     """Decide pairs by step 2 alone, in one kernel; return which it can decide, and which of these are within the cutoff."""
-    sign = _fixed_sign(pair, _threshold(pair, cutoff), by_axis=True)
+    sign = _fixed_sign(pair, cutoff, by_axis=True)
     return sign != _UNKNOWN, sign <= 0 if cutoff.closed else sign < 0
 
 
 def decide_in_integers(pair: Pair, cutoff: Cutoff | Cutoffs) -> Array:
     """Decide [k] pairs by step 3; return which are within the cutoff."""
-    sign = _integer_sign(pair, _threshold(pair, cutoff))
+    sign = _integer_sign(pair, cutoff)
     return sign <= 0 if cutoff.closed else sign < 0
 
 
-class _Threshold(NamedTuple):
-    """The cutoff as steps 2 and 3 use it: scalars, or one value per pair.
-
-    Attributes:
-        radii: The cutoff r; or two radii with mean r, in which case twice the distance is compared with their sum.
-        scale: Power of two that scales the larger radius into [1, 4).
-        less: The limbs of -r² with one cutoff for all pairs, or None.
-    """
-
-    radii: list[Array]
-    scale: Array
-    less: list[Array] | None = None
+def _radii_of(pair: Pair, cutoff: Cutoff | Cutoffs) -> list[Array]:
+    """Return the cutoff r, a scalar or one per pair; or two radii with mean r: twice the distance is compared with their sum."""
+    return [jnp.asarray(cutoff.radius)] if isinstance(cutoff, Cutoff) else pair.radii or []
 
 
-def _threshold(pair: Pair, cutoff: Cutoff | Cutoffs) -> _Threshold:
-    if isinstance(cutoff, Cutoff):
-        return _Threshold([jnp.asarray(cutoff.radius)], jnp.asarray(cutoff.unit_scale), list(jnp.asarray(cutoff.less)))
-    radii = pair.radii or []
-    return _Threshold(radii, unit_scale(functools.reduce(jnp.maximum, radii)))
-
-
-def _fixed_sign(pair: Pair, threshold: _Threshold, by_axis: bool = False) -> Array:
+def _fixed_sign(pair: Pair, cutoff: Cutoff | Cutoffs, by_axis: bool = False) -> Array:
     """Return the sign of |b - a|² - r² where units of step 2 express all its parts, ties included, else _UNKNOWN; int32.
 
     All axes are processed together, so that the program is short, or one after the other, so that all is one kernel.
     """
+    radii, alike = _radii_of(pair, cutoff), isinstance(cutoff, Cutoff)
+    scale = jnp.asarray(cutoff.unit_scale) if alike else unit_scale(functools.reduce(jnp.maximum, radii))  # of the larger radius
     if by_axis:
-        axes = [_square_in_units(pair.along(k), threshold.scale) for k in range(len(pair.b))]
+        axes = [_square_in_units(*pair.along(k), scale) for k in range(len(pair.b))]
         limbs, known = zip(*(x for x, _ in axes), strict=True), [x for _, x in axes]
     else:
-        scale = threshold.scale[None] if threshold.scale.ndim else threshold.scale
-        limbs, known = _square_in_units(_Component(pair.a, pair.b, pair.lattice_terms()), scale)
+        limbs, known = _square_in_units(pair.a, pair.b, pair.lattice_terms(), scale[None] if scale.ndim else scale)
     total, known = [functools.reduce(lax.add, limb) for limb in limbs], functools.reduce(lax.bitwise_and, known)
-    less, times = threshold.less, len(threshold.radii) ** 2
-    if less is None:
-        numbers, wholes = zip(*(_in_units(x, threshold.scale) for x in threshold.radii), strict=True)
+    if isinstance(cutoff, Cutoff):
+        less = list(jnp.asarray(cutoff.less))
+    else:
+        numbers, wholes = zip(*(_in_units(x, scale) for x in radii), strict=True)
         less = [-x for x in _square_limbs(*map(functools.partial(functools.reduce, lax.add), zip(*numbers, strict=True)))]
         known = functools.reduce(lax.bitwise_and, wholes, known)
-    return jnp.where(known, _sign_of_limbs([x * times + y for x, y in zip(total, less, strict=True)]), _UNKNOWN)
+    return jnp.where(known, _sign_of_limbs([x * len(radii) ** 2 + y for x, y in zip(total, less, strict=True)]), _UNKNOWN)
 
 
-def _square_in_units(component: _Component, scale: Array) -> tuple[list[Array], Array]:
-    """Return the limbs of (b - a)² in the units of step 2, and whether these express b - a.
+def _square_in_units(a: Array, b: Array, terms: list[tuple[Array, Array]], scale: Array) -> tuple[list[Array], Array]:
+    """Return the limbs of (b - a)² in the units of step 2, and whether these express b - a: along one axis, or all [d, ...].
 
     A cutoff is below 4 in scaled lengths, and so is each component of a displacement that step 1 leaves open, up to its band.
     The difference of two floats is exactly the sum of two others, where no digit lies below the smallest normal float.
     """
-    dtype = np.dtype(component.a.dtype)
+    dtype = np.dtype(a.dtype)
     eps, limb = jnp.finfo(dtype).eps, UNITS[dtype.itemsize].limb
-    difference, finer = two_sum(component.b, -component.a)
+    difference, finer = two_sum(b, -a)
     numbers, knowns = zip(*(_in_units(x, scale) for x in (difference, finer)), strict=True)
     upper, lower = (x + y for x, y in zip(*numbers, strict=True))
-    known = _has_normal_digits(component.a) & _has_normal_digits(component.b) & knowns[0] & knowns[1]
-    if not component.terms:
+    known = _has_normal_digits(a) & _has_normal_digits(b) & knowns[0] & knowns[1]
+    if not terms:
         return _square_limbs(upper, lower), known & (jnp.abs(difference) * scale < 4.5)
     lowest, lower = lower & ((1 << limb) - 1), lower >> limb
-    estimate, error = difference, 16 * eps * (jnp.abs(component.a) + jnp.abs(component.b))
-    for shift, vector in component.terms:
+    estimate, error = difference, 16 * eps * (jnp.abs(a) + jnp.abs(b))
+    for shift, vector in terms:
         (upper_part, lower_part), whole = _in_units(vector, scale)
         times = shift.astype(limb_type(dtype))
         upper, lower = upper + upper_part * times, lower + (lower_part >> limb) * times
@@ -340,14 +318,14 @@ def _sign_of_limbs(limbs: list[Array]) -> Array:
     return jnp.where(highest == 0, (rest != 0).astype(highest.dtype), jnp.sign(highest)).astype(jnp.int32)
 
 
-def _integer_sign(pair: Pair, threshold: _Threshold) -> Array:
+def _integer_sign(pair: Pair, cutoff: Cutoff | Cutoffs) -> Array:
     """Return the sign of |b - a|² - r² for [k] pairs of finite points, in integer arithmetic only.
 
     Limbs of a difference are below 2^12 (float64: 2^27), in a lattice below 2^30 (2^46, as shifts are below 2^16); so are the sum
     of two radii and twice the differences. A limb of the sum of squares adds 4·29 (4·84) products of limbs carried by
     `carry_limbs`, which stays below 2^30 (2^61).
     """
-    (dim, size), radii, dtype = pair.b.shape, threshold.radii, np.dtype(pair.a.dtype)
+    (dim, size), radii, dtype = pair.b.shape, _radii_of(pair, cutoff), np.dtype(pair.a.dtype)
     count, whole = full_count(dtype) + 3, limb_type(dtype)  # room for carries and the sign
     ends = radii[0], -radii[1] if len(radii) == 2 else jnp.zeros((), dtype)
     ends = [jnp.broadcast_to(x.reshape(1, -1), (1, size)) for x in ends]

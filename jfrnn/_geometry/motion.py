@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -12,22 +11,13 @@ from jfrnn._geometry.lattice import Lattice, nearest_shifts, translation, units_
 from jfrnn._geometry.wrapping import count_turns, unpack_turns
 
 
-class Motion(NamedTuple):
-    """How far points moved, not counting lattice translations: a point that was wrapped into the box has not moved.
+def motion_of(before: Array, now: Array, lattice: Lattice) -> tuple[list[Array], Array, Array]:
+    """Measure the motion of points [n, d] modulo the lattice: a point that was wrapped into the box has not moved.
 
-    Attributes:
-        axes: d arrays [n], the magnitude of each component, rounded up.
-        sure: [n] bool, whether rounding cannot have changed the translations that were subtracted, and S·A is exact for them.
-        home: [n, d] int32, how many lattice vectors each point would lie from the box without those translations.
+    Return the magnitude of each component, rounded up, d arrays [n]; whether rounding cannot have changed the translations that
+    were subtracted, and S·A is exact for them, [n] bool; and how many lattice vectors each point would lie from the box without
+    those translations, [n, d] int32.
     """
-
-    axes: list[Array]
-    sure: Array
-    home: Array
-
-
-def motion_of(before: Array, now: Array, lattice: Lattice) -> Motion:
-    """Measure the motion of points [n, d] modulo the lattice."""
     eps = jnp.finfo(now.dtype).eps
     difference, matrix, transform = now - before, jnp.abs(lattice.matrix), jnp.abs(lattice.transform)
     units, turns = units_of(difference, lattice), turns_between(before, now, lattice)
@@ -41,7 +31,7 @@ def motion_of(before: Array, now: Array, lattice: Lattice) -> Motion:
     sure = jnp.where(lattice.spread(lattice.periodic, 2), jnp.abs(units - turns) + unsure < 0.5, True).all(axis=1)
     packed = count_turns(now, lattice)
     home = unpack_turns(packed, lattice.dim) - jnp.clip(turns, -(2.0**20), 2.0**20).astype(jnp.int32)
-    return Motion(list(left.T), sure & ((packed >= 0) | ~was_turned), home)
+    return list(left.T), sure & ((packed >= 0) | ~was_turned), home
 
 
 def turns_between(before: Array, now: Array, lattice: Lattice) -> Array:
@@ -86,7 +76,7 @@ def _along(points: Array, normal: Array) -> Array:
 def box_change(before: Lattice, now: Lattice, spans: Array) -> Array:
     """Bound the change in displacement that a changed box, or the one of any row, causes for any pair within reach.
 
-    `spans` [d] tells how many lattice vectors lie between the cells of two points at most (`Motion.home`).
+    `spans` [d] tells how many lattice vectors lie between the cells of two points at most, as `motion_of` counts them.
     """
     dtype = now.matrix.dtype
     eps = jnp.finfo(dtype).eps

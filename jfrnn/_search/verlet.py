@@ -91,16 +91,18 @@ def _find_extremes(before: Array, now: Array, lattice: geometry.Lattice | None, 
     """Return the largest scaled square of a motion, infinite where rounding leaves it open, in one reduction.
 
     In a box, behind it come for each axis the largest numbers of lattice vectors that a point lies from the box, backward and
-    forward (`Motion.home`).
+    forward, as `motion_of` counts them.
     """
-    motion = None if lattice is None else geometry.motion_of(before, now, lattice)
-    square = geometry.squared_distance(list((now - before).T) if motion is None else motion.axes, half_skin)
-    square = square if motion is None else jnp.where(motion.sure, square, jnp.inf)
+    axes, sure, home = list((now - before).T), None, None
+    if lattice is not None:
+        axes, sure, home = geometry.motion_of(before, now, lattice)
+    square = geometry.squared_distance(axes, half_skin)
+    square = square if sure is None else jnp.where(sure, square, jnp.inf)
     there = jnp.isfinite(before).all(axis=1) | jnp.isfinite(now).all(axis=1)
     rows = [jnp.where(there, square, 0)]
-    if motion is not None:
-        home = motion.home.astype(square.dtype)
-        rows += [*-home.T, *home.T]
+    if home is not None:
+        home = home.T.astype(square.dtype)
+        rows += [*-home, *home]
     least = [np.array(-np.inf, square.dtype)] * len(rows)
     return jnp.stack(lax.reduce(rows, least, lambda a, b: [lax.max(x, y) for x, y in zip(a, b, strict=True)], (0,)))
 

@@ -18,20 +18,10 @@ _BLOCK = 1 << 16  # slots processed at a time
 _ROUNDING = 32  # error bound in eps of the largest relative coordinate: distances have 4, nearest points a few
 
 
-class Nearest(NamedTuple):
-    """The nearest points of shapes, relative to points.
+def nearest_of(points: Array, corners: Array) -> tuple[Array, Array]:
+    """Return vectors [..., d] from points to the nearest points of closed shapes [..., corner, d], and features [...] int32.
 
-    Attributes:
-        vectors: Vector from the point to its nearest point, [..., d].
-        feature: The corner, side or face on which that lies, [...] int32.
-    """
-
-    vectors: Array
-    feature: Array
-
-
-def nearest_of(points: Array, corners: Array) -> Nearest:
-    """Compute the nearest points of closed shapes [..., corner, d] to points [..., d].
+    A feature is the corner, side or face on which a nearest point lies.
 
     The candidates are the foot of the point on each side and on the face. Each is exact for a shape whose corners are moved by a
     few roundings of the largest coordinate relative to the point, so distances have that accuracy, even for slivers.
@@ -56,7 +46,7 @@ def nearest_of(points: Array, corners: Array) -> Nearest:
     if dim == 3:
         found.append((*_foot_on_face(x), jnp.full(unit.shape, _FACE, jnp.int32)))
     _, foot, feature = functools.reduce(nearer_of, found)
-    return Nearest(jnp.stack(foot, axis=-1) * unit[..., None], feature)
+    return jnp.stack(foot, axis=-1) * unit[..., None], feature
 
 
 def _foot_on_face(x: list[Vector]) -> tuple[Array, Vector]:
@@ -85,45 +75,32 @@ def _foot_on_face(x: list[Vector]) -> tuple[Array, Vector]:
     return jnp.where(inside, dot(foot, foot), jnp.inf), foot
 
 
-class Rows(NamedTuple):
-    """Triangles near points, and the feature of the nearest one in each row.
-
-    Attributes:
-        idx: Triangle indices, shape [n, capacity], int32.
-        used: Number of slots in use per row, shape [n], int32.
-        triangle: The nearest triangle, shape [n], int32.
-        feature: The corner, side or face of it on which the nearest point lies, shape [n], int32.
-    """
-
-    idx: Array
-    used: Array
-    triangle: Array
-    feature: Array
-
-
-def pseudonormals(rows: Rows, faces: Array, corners: Array, good: Array, asked: Array) -> Array:
+def pseudonormals(
+    idx: Array, used: Array, triangle: Array, feature: Array, faces: Array, corners: Array, good: Array, asked: Array
+) -> Array:
     """Return unit pseudonormals at the nearest points of the rows asked for [n] bool, [n, d]; 0 if shapes have no area.
 
     The pseudonormal of a face is its normal, that of a side the sum of the normals of the faces sharing it, and that of a vertex
     the sum over the faces around it, weighted with their angles; in 2D a vertex has the sum of both segments. All these faces are
     equally near, so they are in the same row. Faces [f, corner] int32 run counterclockwise as seen from outside, so do segments
     around what they enclose; their corners are [f, corner, d], and those that are valid `good` [f].
+    Rows idx [n, capacity] have so many slots `used` [n]; the nearest point of each lies on a `feature` [n] of a `triangle` [n].
     Source: Baerentzen & Aanaes (2005), doi:10.1109/TVCG.2005.49.
     """
-    n, capacity = rows.idx.shape
+    n, capacity = idx.shape
     block = min(max(_BLOCK // capacity, 1), n)
     queue, total = set_places(asked, n + block), jnp.sum(asked, dtype=jnp.int32)
 
     def add_block(b: Array, normals: Array) -> Array:
         place = lax.dynamic_slice_in_dim(queue, b * block, block)
         own = jnp.minimum(place, n - 1)
-        slots, feature = rows.idx[own], rows.feature[own]
-        shape = jnp.where(lax.broadcasted_iota(jnp.int32, slots.shape, 1) < rows.used[own, None], slots, len(faces))
+        slots, features = idx[own], feature[own]
+        shape = jnp.where(lax.broadcasted_iota(jnp.int32, slots.shape, 1) < used[own, None], slots, len(faces))
         known = jnp.minimum(shape, len(faces) - 1)
         there = (shape < len(faces)) & good[known]
-        weights = _weights(faces[known], faces[rows.triangle[own]], corners[known], feature)
-        alone = feature >= (_FACE if faces.shape[1] == 3 else _SIDE)
-        weights = jnp.where(alone[:, None], (slots == rows.triangle[own, None]).astype(weights.dtype), weights)
+        weights = _weights(faces[known], faces[triangle[own]], corners[known], features)
+        alone = features >= (_FACE if faces.shape[1] == 3 else _SIDE)
+        weights = jnp.where(alone[:, None], (slots == triangle[own, None]).astype(weights.dtype), weights)
         sums = jnp.sum(jnp.where(there, weights, 0)[..., None] * _face_normals(corners[known]), axis=1)
         return normals.at[place].set(_unit(sums), mode="drop")
 
@@ -199,7 +176,7 @@ def are_contacts(mask: Array, triangle: Array, faces: Array, seen: Array, vector
 
     Of each slot, `triangle` [n, k] is the index of its triangle, 0 where masked, in faces [f, corner]; `seen` [n, k, corner, d] are
     the corners relative to the particle, and `vectors` [n, k, d] lead to the nearest point, over a `distance` [n, k], on a
-    `feature` [n, k], as in `Nearest`.
+    `feature` [n, k], as `nearest_of` says.
     """
     dim = faces.shape[1]
     named, alone = faces[triangle], feature >= (_FACE if dim == 3 else _SIDE)

@@ -129,7 +129,7 @@ def nearest_slots(
             slot = jnp.where(at < until[-1], at - (until[particle] - used[particle]), 0)
             triangle = jnp.where(at < until[-1], rows[particle, slot], 0)
             near = decide(own, corners, particle, triangle, cutoff, (at < until[-1]) & good[triangle])
-            lengths = norms(nearest_of(own[particle], corners[triangle]).vectors)
+            lengths = norms(nearest_of(own[particle], corners[triangle])[0])
             now = least.at[particle].min(jnp.where(near, lengths, jnp.inf))
             wins = jnp.where(near & (lengths == now[particle]), particle, block)
             return begin + block, now, jnp.where(now < least, capacity, slots).at[wins].min(slot, mode="drop")

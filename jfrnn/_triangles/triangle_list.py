@@ -15,7 +15,7 @@ from jfrnn import _geometry as geometry
 from jfrnn._search import norms, round_capacity
 from jfrnn._tracing import IndexRows, Points, Real, as_array, call_apart, compile_program, own_transfers
 from jfrnn._triangles.cells import TriangleCells, gather_corners
-from jfrnn._triangles.closest import Rows, are_contacts, nearest_of, pseudonormals
+from jfrnn._triangles.closest import are_contacts, nearest_of, pseudonormals
 from jfrnn._triangles.crossings import are_crossed
 from jfrnn._triangles.engines import TRIANGLE_ENGINES, TriangleEngine, count_slots, find_fields
 from jfrnn._triangles.rows import are_near, nearest_slots
@@ -390,7 +390,7 @@ def _signed_distance(tri: TriangleList, points: Array, vertices: Array) -> Signe
 
     inside, unknown = call_apart(sides, tree, fixed, at, good, apart & watertight)
     by_normal = some & (unknown | ~(apart & watertight))
-    normal = call_apart(pseudonormals, Rows(tri.idx, used, triangle, feature), tri.faces, fixed, good, by_normal)
+    normal = call_apart(pseudonormals, tri.idx, used, triangle, feature, tri.faces, fixed, good, by_normal)
     height = jnp.sum(normal * away, axis=1)
     signed = jnp.where(jnp.where(by_normal, height < 0, inside), -distance, distance)
     signed = jnp.where(distance > 0, signed, height)

@@ -17,7 +17,7 @@ from hypothesis.extra import numpy as hnp
 
 import jfrnn
 from jfrnn._geometry.cutoffs import RANGE_OF, Radii, make_cutoff, make_cutoffs
-from jfrnn._geometry.exact import _UNKNOWN, Pair, _fixed_sign, _integer_sign, _threshold, is_pair_of
+from jfrnn._geometry.exact import _UNKNOWN, Pair, _fixed_sign, _integer_sign, is_pair_of
 from jfrnn._geometry.images import images_of
 from jfrnn._geometry.lattice import make_lattice, shift_pairs
 
@@ -82,8 +82,7 @@ def ulp_pairs(dtype, seed, count=256, scale=1.0, offset=0.0):
 
 def signs(pair, cutoff):
     """Return what steps tell of pairs: the second one, that one axis by axis, and the third."""
-    threshold = _threshold(pair, cutoff)
-    return _fixed_sign(pair, threshold), _fixed_sign(pair, threshold, by_axis=True), _integer_sign(pair, threshold)
+    return _fixed_sign(pair, cutoff), _fixed_sign(pair, cutoff, by_axis=True), _integer_sign(pair, cutoff)
 
 
 @jax.jit

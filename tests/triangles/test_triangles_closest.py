@@ -30,7 +30,7 @@ PAIRS = 400
 @jax.jit
 def _nearest(points, corners):
     """Return nearest points, their vectors and distances: one program for all tests of pairs, `PAIRS` at a time."""
-    vectors = nearest_of(points, corners).vectors
+    vectors = nearest_of(points, corners)[0]
     return points + vectors, vectors, norms(vectors)
 
 

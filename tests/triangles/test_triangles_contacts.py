@@ -113,7 +113,7 @@ def described(x, corners, mask, points, distance):
 
 @jax.jit
 def _nearest(points, corners):
-    return nearest_of(points, corners).vectors
+    return nearest_of(points, corners)[0]
 
 
 @pytest.mark.parametrize("mesh", [pytest.param(meshes.cube(2.0, 4), id="3d"), slow(meshes.circle(1.0, 64), id="2d")])
