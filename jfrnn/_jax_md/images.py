@@ -88,10 +88,9 @@ def neighbor_list_multi_image(  # noqa: D417 (four arguments share a line)
         used = kept.idx < n
         if form is OrderedSparse:
             i = jnp.arange(n, dtype=jnp.int32)[:, None]
-            first, ahead = jnp.zeros(used.shape, bool), i < kept.idx
-            for k in range(shifts.shape[-1]):  # the first number that is not 0 decides
-                ahead = jnp.where(~first & (shifts[..., k] != 0), shifts[..., k] > 0, ahead)
-                first = first | (shifts[..., k] != 0)
+            ahead = i < kept.idx
+            for k in reversed(range(shifts.shape[-1])):  # the first number that is not 0 decides
+                ahead = jnp.where(shifts[..., k] != 0, shifts[..., k] > 0, ahead)
             used = used & ahead
         if form is Dense:
             more = ((0, 0), (0, max(room - kept.capacity, 0)))

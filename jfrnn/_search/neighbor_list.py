@@ -369,10 +369,9 @@ class NeighborList(KeptSearch):
         Shifts are those of `vectors_of`: between near points, or as they are given.
         """
         self._check_known(spared=self._harmless)
-        if 0 in (sources.shape[0], *self.idx.shape):
-            with own_transfers():
-                return jnp.zeros((*self.idx.shape, sources.shape[1]), sources.dtype), jnp.zeros(self.idx.shape, bool), None
         with own_transfers():
+            if 0 in (sources.shape[0], *self.idx.shape):
+                return jnp.zeros((*self.idx.shape, sources.shape[1]), sources.dtype), jnp.zeros(self.idx.shape, bool), None
             return vectors_of(self._at(sources, rows, box), as_given and box is not None)
 
     def _at(self, sources: Array, rows: Array, box: Box | None) -> Present:
