@@ -210,7 +210,9 @@ def exclude_in_lattice(
     else:
         numbers = None if images.basis is None else jnp.asarray(images.numbers, jnp.int32)
     if numbers is not None:
-        inverse = _inverse(numbers)
+        cofactors = adjugate(numbers)
+        determinant = functools.reduce(jnp.add, (numbers[..., 0, k] * cofactors[..., k, 0] for k in range(dim)))  # 1 or -1
+        inverse = cofactors * determinant[..., None, None]
         shifts = functools.reduce(jnp.add, (shifts[:, k, None] * inverse[..., k, :] for k in range(dim)))
     shifts = shifts - unpack_turns(wrapped.query_turns, dim)[row] + unpack_turns(wrapped.turns, dim)[rows.others]
     reach = np.array(images.reach, np.int32)
@@ -223,10 +225,3 @@ def _sorted(rows: ExcludedRows, codes: Array) -> ExcludedCodes:
     late = jnp.where(codes < 0, np.iinfo(np.int32).max, codes)
     order = jnp.lexsort((rows.others, late, rows.row_of_each))
     return ExcludedCodes(rows.starts, rows.others[order], codes[order])
-
-
-def _inverse(numbers: Array) -> Array:
-    """Invert whole numbers [..., d, d] of determinant 1 or -1 by cofactors."""
-    cofactors = adjugate(numbers)
-    determinant = functools.reduce(jnp.add, (numbers[..., 0, k] * cofactors[..., k, 0] for k in range(numbers.shape[-1])))
-    return cofactors * determinant[..., None, None]

@@ -92,10 +92,10 @@ def _find(relation: Relation, term: Term, operands: Groups, largest: bool) -> li
         return extremes(relation.inputs, relation.options, term, operands, largest)
     m, n = relation.sizes
 
-    def start(rows: int, like: jax.ShapeDtypeStruct) -> _Best:
+    def start(like: jax.ShapeDtypeStruct) -> _Best:
         elements = int(np.prod(like.shape))
-        best, source = jnp.full((rows, elements), -jnp.inf, like.dtype), jnp.full((rows, elements), n, jnp.int32)
-        return best, source, jnp.zeros((rows, elements, *term.shift.shape), term.shift.dtype) if relation.periodic else None
+        best, source = jnp.full((m, elements), -jnp.inf, like.dtype), jnp.full((m, elements), n, jnp.int32)
+        return best, source, jnp.zeros((m, elements, *term.shift.shape), term.shift.dtype) if relation.periodic else None
 
     def visit(block: Block, out: list[_Best]) -> list[_Best]:
         def add(slots: Slots, state: list[_Best]) -> list[_Best]:
@@ -106,7 +106,7 @@ def _find(relation: Relation, term: Term, operands: Groups, largest: bool) -> li
         place = jnp.where(block.fresh, block.query, m)
         return jax.tree.map(lambda all_rows, some: all_rows.at[place].set(some, mode="drop"), out, done)
 
-    return relation.fold(term.elements, visit, [start(m, like) for like in term.summands])
+    return relation.fold(term.elements, visit, list(map(start, term.summands)))
 
 
 def _best_of(values: Array, slots: Slots, n: int) -> _Best:

@@ -12,6 +12,7 @@ element to the last. Simplifications respect NaN, infinities and signed zeros. A
 selected.
 """
 
+import functools
 import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -149,9 +150,6 @@ def _run(scalars: Scalars, nested: Internal, inputs: Sequence[Values]) -> list[V
             return known[atom]
         return _constants(scalars, np.asarray(atom.val, _spec(atom.aval, "a constant").dtype))
 
-    def run(nested: Internal, inputs: Sequence[Values]) -> list[Values]:
-        return _run(scalars, nested, inputs)
-
     for eqn in jaxpr.eqns:
         name = eqn.primitive.name
         if name not in TABLE:
@@ -159,6 +157,7 @@ def _run(scalars: Scalars, nested: Internal, inputs: Sequence[Values]) -> list[V
                 f'the primitive {name!r} has no translation into a kernel: write the function without it, or pass backend="jax".'
             )
         specs = [_spec(v.aval, f"a result of {name!r}") for v in eqn.outvars]
-        results = TABLE[name](Equation(scalars, eqn.primitive, eqn.params, specs, run), [read(v) for v in eqn.invars])
+        equation = Equation(scalars, eqn.primitive, eqn.params, specs, functools.partial(_run, scalars))
+        results = TABLE[name](equation, [read(v) for v in eqn.invars])
         known |= zip(eqn.outvars, results, strict=True)
     return [read(v) for v in jaxpr.outvars]
