@@ -56,8 +56,7 @@ def test_hard_cases(dtype, dim, names):
         points, rows, periodic = in_3d(given.positions.astype(np.float64), given.matrix.astype(np.float64), given.periodic)
         cutoff = float(dtype(given.cutoff))
         if not np.isfinite(points).all():
-            with pytest.raises(ValueError, match="positions must be finite"):
-                primitive_neighbor_list("i", periodic, rows, points, cutoff)
+            refuses(ValueError, "positions must be finite", primitive_neighbor_list, "i", periodic, rows, points, cutoff)
             points = points[np.isfinite(points).all(axis=1)]
         i, j, s, vectors, d = primitive_neighbor_list("ijSDd", periodic, rows, points, cutoff)
         assert as_set(i, j, s) == reference.reference_images(points, cutoff, matrix=rows, periodic=periodic), name
@@ -315,10 +314,8 @@ def test_forms_of_matscipy_and_vesin():
     }
     with pytest.raises(ValueError, match="quantities must be letters of 'ijPSDd'"):
         jfrnn.vesin.NeighborList(cutoff=2.0, full_list=True).compute(x, cell, True, "x")
-    with pytest.raises(TypeError, match=r"cutoff must be a number \[length\], got list"):
-        jfrnn.vesin.NeighborList(cutoff=["a"], full_list=True)
-    with pytest.raises(ValueError, match="algorithm must be"):
-        jfrnn.vesin.NeighborList(cutoff=2.0, full_list=True, algorithm="tree")
+    refuses(TypeError, r"cutoff must be a number \[length\], got list", jfrnn.vesin.NeighborList, cutoff=["a"], full_list=True)
+    refuses(ValueError, "algorithm must be", jfrnn.vesin.NeighborList, cutoff=2.0, full_list=True, algorithm="tree")
 
 
 @pytest.mark.parametrize("peer", ["ase", "matscipy", "vesin"])

@@ -11,6 +11,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+from checked import refuses
 
 from jfrnn._engine import Clear, Launch, Plan, launch, plans, start
 from jfrnn.kernels import Field, Kernel, Program, _clang, _compile, _driver, _nvrtc, one_at_a_time
@@ -383,11 +384,9 @@ def test_a_program_for_cuda_that_is_kept_is_not_compiled_again(monkeypatch, tmp_
         del library
     assert compiled == [(".cubin", 90)]
     assert loaded == [(b".entry kept(", [0x100])] * 2
-    with pytest.raises(RuntimeError, match="cannot be loaded"):
-        _compile.load(Program("broken", "broken", cuda=True), "cuda:1")
+    refuses(RuntimeError, "cannot be loaded", _compile.load, Program("broken", "broken", cuda=True), "cuda:1")
     monkeypatch.setattr(_nvrtc, "known_archs", lambda: (75, 80))
-    with pytest.raises(RuntimeError, match="cannot be loaded"):
-        _compile.load(Program("broken", "broken of the future", cuda=True), "cuda:1")
+    refuses(RuntimeError, "cannot be loaded", _compile.load, Program("broken", "broken of the future", cuda=True), "cuda:1")
     assert compiled == [(".cubin", 90)] * 3 + [(".ptx", 80)] * 2
     monkeypatch.setattr(_nvrtc, "known_archs", tuple)
     with pytest.raises(RuntimeError, match=r"knows the compute capabilities \[\], none of which fits 90"):
@@ -448,8 +447,7 @@ def test_who_waits_long_for_compilers_is_told_once(monkeypatch, caplog):
     start.wait_for([])
     failed = Future()
     failed.set_exception(RuntimeError("does not compile"))
-    with pytest.raises(RuntimeError, match="does not compile"):
-        start.wait_for([failed])
+    refuses(RuntimeError, "does not compile", start.wait_for, [failed])
 
 
 def test_what_failed_begins_anew():
@@ -457,8 +455,7 @@ def test_what_failed_begins_anew():
     jobs[0].set_exception(RuntimeError("a full disk"))
     jobs[1].set_result(None)
     begin = functools.cache(lambda: jobs.pop(0) if jobs else None)
-    with pytest.raises(RuntimeError, match="a full disk"):
-        start.finish(begin)
+    refuses(RuntimeError, "a full disk", start.finish, begin)
     for _ in range(2):
         start.finish(begin)
     assert jobs == []

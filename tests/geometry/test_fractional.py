@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import reference
 from by_numpy import in_order
-from checked import as_set, slow
+from checked import as_set, refuses, slow
 from test_box import image_pairs, masked_images, pull_back
 from test_boxes import oracle as oracle_of_systems
 
@@ -192,8 +192,7 @@ def test_derivatives_in_coordinates_and_vectors_are_those_of_the_product(way, pe
 
 def test_errors():
     u, box = points(np.float32), jfrnn.Box(SKEWED, fractional=True)
-    with pytest.raises(TypeError, match="fractional must be True or False, known while tracing, got 'yes'"):
-        jfrnn.Box(SKEWED, fractional="yes")
+    refuses(TypeError, "fractional must be True or False, known while tracing, got 'yes'", jfrnn.Box, SKEWED, fractional="yes")
     nbrs = jfrnn.search(u, 0.3, box=box, capacity=64)
     with pytest.raises(ValueError, match=r"of the kind with which the list was made \(.*matrix, fractional\), got .*matrix\."):
         nbrs.update(u, box=jfrnn.Box(SKEWED))

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
-from checked import slow
+from checked import refuses, slow
 
 import jfrnn
 
@@ -144,6 +144,5 @@ def test_a_list_with_a_skin_keeps_them(who, flat):
 
 def test_separate_queries_have_no_self():
     x, cutoff, _ = scene("gather", np.float32)
-    with pytest.raises(ValueError, match="include_self=True"):
-        jfrnn.search(x, cutoff, queries=x, include_self=True)
+    refuses(ValueError, "include_self=True", jfrnn.search, x, cutoff, queries=x, include_self=True)
     assert jfrnn.count(x[:1], np.zeros(1, np.float32), queries=x[2:3])[0] == 0

@@ -105,8 +105,7 @@ def test_edges_of_images_have_their_shifts():
 
 
 def test_where_pairs_are_needs_positions():
-    with pytest.raises(TypeError, match=r"queries tell where pairs are now.*pass positions="):
-        jfrnn.search(X, 0.3).pairs(queries=X)
+    refuses(TypeError, r"queries tell where pairs are now.*pass positions=", jfrnn.search(X, 0.3).pairs, queries=X)
 
 
 def test_rows_that_overflowed_export_what_they_hold_and_carry_the_status():
@@ -164,8 +163,7 @@ def test_a_total_that_is_too_small_sets_a_bit_that_stays():
     short, (rows, _) = steps(nbrs, held - 1)
     assert rows[-1] < 50
     assert jfrnn.Status(int(short.status)) == jfrnn.Status.TOTAL_OVERFLOW
-    with pytest.raises(ValueError, match=r"more pairs than the `total` that `require` was told.*At present it holds 0"):
-        short.check()
+    refuses(ValueError, r"more pairs than the `total` that `require` was told.*At present it holds 0", short.check)
     refuses(ValueError, f"At present it holds {held}", nbrs.require(1).check)
     nbrs.require(1).grow(X).check()
 

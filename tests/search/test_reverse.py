@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
-from checked import slow, sparing
+from checked import refuses, slow, sparing
 from test_kept import by_arrays
 
 import jfrnn
@@ -257,10 +257,8 @@ def test_nobody(kind):
 
 def test_too_many_slots_are_refused():
     x = jax.ShapeDtypeStruct((2**25, 3), np.float32)
-    with pytest.raises(ValueError, match="numbers slots by int32"):
-        jax.eval_shape(lambda x: jfrnn.search(x, 0.1, capacity=64, reverse=True), x)
-    with pytest.raises(TypeError, match="reverse"):
-        jfrnn.search(np.zeros((2, 3)), 1.0, reverse=1)
+    refuses(ValueError, "numbers slots by int32", jax.eval_shape, lambda x: jfrnn.search(x, 0.1, capacity=64, reverse=True), x)
+    refuses(TypeError, "reverse", jfrnn.search, np.zeros((2, 3)), 1.0, reverse=1)
 
 
 MEASURED = [(box, dim, 1.0) for box in BOXES for dim in (2, 3)] + [("open", 3, 1e-24), ("nearest", 3, 1e15)]

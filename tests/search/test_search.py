@@ -330,8 +330,7 @@ def test_atoms_are_told_where_their_positions_are():
     class Atoms:
         positions = np.zeros((2, 3))
 
-    with pytest.raises(TypeError, match=r"got Atoms, which has one: pass atoms\.positions, with a cell box=jfrnn\.Box"):
-        jfrnn.search(Atoms(), 1.0)
+    refuses(TypeError, r"got Atoms, which has one: pass atoms\.positions, with a cell box=jfrnn\.Box", jfrnn.search, Atoms(), 1.0)
 
 
 def test_near_ties_among_more_particles_than_meet_at_once():

@@ -211,8 +211,7 @@ def test_a_chunk_is_replayed_until_its_list_was_large_enough():
     assert masked_pairs(nbrs, end) == reference.reference_pairs(np.asarray(end), CUTOFF)
     once, _ = squeeze(x, nbrs)
     np.testing.assert_array_equal(once, end)
-    with pytest.raises(TypeError, match="jit the chunk, not the loop"):
-        jax.jit(lambda x: jfrnn.run_chunk(squeeze, x, nbrs, lambda x: x)[0])(x)
+    refuses(TypeError, "jit the chunk, not the loop", jax.jit(lambda x: jfrnn.run_chunk(squeeze, x, nbrs, lambda x: x)[0]), x)
 
 
 @pytest.mark.parametrize(
@@ -266,8 +265,7 @@ def test_refusals(dim):
     x = points(10, dim, np.float32)
     refuses(ValueError, r"skin=-0.1 must be 0 \(no skin\) or between", jfrnn.search, x, CUTOFF, skin=-0.1)
     refuses(ValueError, "skin=nan must be 0", jfrnn.search, x, CUTOFF, skin=float("nan"))
-    with pytest.raises(TypeError, match="skin must be a number known while tracing, got str 'wide'"):
-        jfrnn.search(x, CUTOFF, skin="wide")
+    refuses(TypeError, "skin must be a number known while tracing, got str 'wide'", jfrnn.search, x, CUTOFF, skin="wide")
     with pytest.raises(TypeError, match="skin must be a number known while tracing, got a traced value"):
         jax.jit(lambda s: jfrnn.search(x, CUTOFF, skin=s, capacity=4))(0.1)
     with pytest.raises(TypeError, match=r"active must be an array of bool, one per particle, got int64 of shape \[10\]"):
@@ -275,8 +273,6 @@ def test_refusals(dim):
     with pytest.raises(ValueError, match=r"active must have shape \[10\], one bool per particle, got shape \[9\]"):
         jfrnn.search(x, CUTOFF, active=np.ones(9, bool))
     nbrs = jfrnn.search(x, CUTOFF, skin=SKIN)
-    with pytest.raises(ValueError, match="this list was made without active: leave active out"):
-        nbrs.update(x, active=np.ones(10, bool))
+    refuses(ValueError, "this list was made without active: leave active out", nbrs.update, x, active=np.ones(10, bool))
 
-    with pytest.raises(ValueError, match="this list was made with active: pass active="):
-        jfrnn.search(x, CUTOFF, active=np.ones(10, bool)).update(x)
+    refuses(ValueError, "this list was made with active: pass active=", jfrnn.search(x, CUTOFF, active=np.ones(10, bool)).update, x)

@@ -68,8 +68,7 @@ def test_exclusions_that_name_nobody_are_named():
 def test_lists_that_are_no_arrays():
     with pytest.raises(TypeError, match=r"x must be an array, got a list of which NumPy makes none: .*inhomogeneous"):
         as_array("x", [[0.0], [0.0, 1.0]])
-    with pytest.raises(TypeError, match="x must be an array of numbers, got a list of which NumPy makes <U1"):
-        as_array("x", ["a"])
+    refuses(TypeError, "x must be an array of numbers, got a list of which NumPy makes <U1", as_array, "x", ["a"])
     with pytest.raises(TypeError, match=r"x must be an array, got a tuple of traced values: pass jnp.stack\(x\)"):
         jax.eval_shape(lambda x: as_array("x", (x, x)), jnp.zeros(2))
     assert as_array("x", [1, 2], np.dtype(np.float32)).dtype == np.float32

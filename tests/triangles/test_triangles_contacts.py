@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
-from checked import slow, slowly
+from checked import refuses, slow, slowly
 from jax.extend.core import jaxprs_in_params
 
 import jfrnn
@@ -239,6 +239,5 @@ def test_every_integer_type_names_the_same_particles():
 def test_errors():
     x = np.zeros((2, 3), np.float32)
     tri = jfrnn.search_triangles(x, np.eye(3, dtype=np.float32), np.array([[0, 1, 2]]), 1.0, capacity=1)
-    with pytest.raises(TypeError, match=r"pairs must be integers of shape \[e, 2\].*got float64 of shape \[2\]"):
-        tri.between(x, np.zeros(2))
+    refuses(TypeError, r"pairs must be integers of shape \[e, 2\].*got float64 of shape \[2\]", tri.between, x, np.zeros(2))
     assert tri.between(x, np.zeros((0, 2), int)).shape == (0,)

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import launched
 import numpy as np
 import pytest
-from checked import sparing
+from checked import refuses, sparing
 
 import jfrnn
 from jfrnn._engine import auto as _auto
@@ -170,5 +170,4 @@ def test_platforms_without_kernels_take_arrays(monkeypatch):
     for module in (_auto, _triangles):
         monkeypatch.setattr(module, "platform_of", lambda *_: "rocm")
     assert _triangles._choose_engine("auto", x).name == "jax"
-    with pytest.raises(RuntimeError, match="on the CPU and on CUDA, got 'rocm'"):
-        _triangles._choose_engine("bvh", x)
+    refuses(RuntimeError, "on the CPU and on CUDA, got 'rocm'", _triangles._choose_engine, "bvh", x)

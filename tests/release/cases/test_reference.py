@@ -72,8 +72,7 @@ def test_queries_have_no_self():
     assert reference_pairs(sources, 1.0, queries=queries) == {(0, 0), (1, 1)}
     assert reference_pairs(sources, 1.0, queries=queries, closed=True) == {(0, 0), (0, 1), (1, 1)}
     for option in ("half", "include_self"):
-        with pytest.raises(ValueError, match="leave them out with queries"):
-            reference_pairs(sources, 1.0, queries=queries, **{option: True})
+        refuses(ValueError, "leave them out with queries", reference_pairs, sources, 1.0, queries=queries, **{option: True})
 
 
 def test_points_that_are_not_finite_have_no_pairs():
@@ -205,8 +204,7 @@ def test_queries_have_images_and_no_self():
     assert reference_images(sources, 0.5, **options) == at
     assert reference_images(sources, 0.5, closed=True, **options) == at | {(2, 0, (0, 0)), (2, 0, (1, 0))}
     for option in ("half", "include_self"):
-        with pytest.raises(ValueError, match="leave them out with queries"):
-            reference_images(sources, 0.5, **options, **{option: True})
+        refuses(ValueError, "leave them out with queries", reference_images, sources, 0.5, **options, **{option: True})
 
 
 def test_images_leave_out_what_is_not_finite():
@@ -244,8 +242,7 @@ DEPENDENT, SHAPE = "linearly independent", r"shape \[3\] or \[3, 3\]"
     ],
 )
 def test_refuses_a_lattice_that_is_none(message, matrix, periodic):
-    with pytest.raises(ValueError, match=message):
-        reference_images(np.zeros((2, 3)), 1e-20, matrix=np.array(matrix), periodic=periodic)
+    refuses(ValueError, message, reference_images, np.zeros((2, 3)), 1e-20, matrix=np.array(matrix), periodic=periodic)
 
 
 def test_takes_a_lattice_that_is_nearly_none():
@@ -416,8 +413,7 @@ ROW = np.array([[1, 2, 3]], np.int32)
     ],
 )
 def test_pairs_of_refuses(idx, count, message):
-    with pytest.raises(AssertionError, match=message):
-        pairs_of(np.array(idx, getattr(idx, "dtype", np.int32)), np.array(count, np.int32), 3)
+    refuses(AssertionError, message, pairs_of, np.array(idx, getattr(idx, "dtype", np.int32)), np.array(count, np.int32), 3)
 
 
 # The hard cases

@@ -8,6 +8,7 @@ from dataclasses import replace
 import jax
 import numpy as np
 import pytest
+from checked import refuses
 from places import ROOT
 from typer.testing import CliRunner
 
@@ -43,8 +44,7 @@ def config():
 def test_config_errors_name_the_key(tmp_path):
     path = tmp_path / "gpu.toml"
     path.write_text(CONFIG.read_text().replace("repeats = 5", "repeats = 0\nrepeat = 5"))
-    with pytest.raises(UsageError, match=r"(?s)gpu\.toml.*repeats.*repeat"):
-        _config.load(path, gpu.Config)
+    refuses(UsageError, r"(?s)gpu\.toml.*repeats.*repeat", _config.load, path, gpu.Config)
 
 
 def test_rows_of_a_scene_are_checked_and_timed(config):

@@ -3,6 +3,7 @@ from itertools import combinations, product
 
 import numpy as np
 import pytest
+from checked import refuses
 
 from experiments import _compare, _oracle
 from experiments.methods import Found
@@ -71,8 +72,7 @@ def test_the_full_lattice_of_the_thesis():
 
 
 def test_a_cutoff_that_float64_cannot_square():
-    with pytest.raises(ValueError, match=r"cutoff 1e-200 is outside .*not safe in float64"):
-        _oracle.find_pairs(np.zeros((2, 3)), 1e-200)
+    refuses(ValueError, r"cutoff 1e-200 is outside .*not safe in float64", _oracle.find_pairs, np.zeros((2, 3)), 1e-200)
 
 
 def test_neighbor_counts_are_those_of_the_pairs():
@@ -153,5 +153,4 @@ def test_errors_of_counts():
 
 
 def test_an_adapter_that_gives_nothing():
-    with pytest.raises(ValueError, match="neither pairs nor counts"):
-        _compare.compare(Found(0), EXACT, SIZE)
+    refuses(ValueError, "neither pairs nor counts", _compare.compare, Found(0), EXACT, SIZE)

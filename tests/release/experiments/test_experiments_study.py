@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from checked import refuses
 from test_experiments_report import SCENES, make_row, make_rows
 
 from experiments import _figures, _study, _thesis
@@ -64,8 +65,7 @@ def test_effects_name_every_value_and_adjust_for_their_number():
 
 
 def test_a_sweep_without_rows_says_what_makes_them():
-    with pytest.raises(UsageError, match="none: no rows; fill it with `python -m experiments run"):
-        _study.rows("none")
+    refuses(UsageError, "none: no rows; fill it with `python -m experiments run", _study.rows, "none")
 
 
 def test_table_6_1_stands_beside_ours():

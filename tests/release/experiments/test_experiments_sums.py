@@ -5,6 +5,7 @@ import math
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from checked import refuses
 from places import ROOT
 from typer.testing import CliRunner
 
@@ -82,8 +83,7 @@ def test_rows_that_are_there_are_not_measured_again(folder, monkeypatch):
     monkeypatch.setattr(sums._sweep, "ask", fail)
     config = _config.load(folder / "tiny.toml", sums.Config)
     assert [row["way"] for row in sums.run(config, folder)] == list(config.ways)
-    with pytest.raises(AssertionError, match="measured again"):
-        sums.run(config.model_copy(update={"repeats": 3}), folder)
+    refuses(AssertionError, "measured again", sums.run, config.model_copy(update={"repeats": 3}), folder)
 
 
 def test_a_row_is_on_disk_before_the_next_one_starts(tmp_path, monkeypatch):

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import psutil
 import pytest
+from checked import refuses
 from places import ROOT
 from typer.testing import CliRunner
 
@@ -277,10 +278,8 @@ def test_of_one_key_a_row_with_figures_counts_when_rows_are_merged(tmp_path):
     assert _sweep.merge(tmp_path / "good", [tmp_path / "more"]) == 1
     assert [row.seconds for row in _rows.RowFile(tmp_path / "good").read()] == [[0.1, 0.1]]
     assert _sweep.merge(tmp_path / "good", [tmp_path / "bad"]) == 0
-    with pytest.raises(UsageError, match="none: no rows to merge"):
-        _sweep.merge(tmp_path / "good", [tmp_path / "none"])
-    with pytest.raises(UsageError, match="good: no folders shard-K-of-N in it; name the folders"):
-        _sweep.merge(tmp_path / "good", [])
+    refuses(UsageError, "none: no rows to merge", _sweep.merge, tmp_path / "good", [tmp_path / "none"])
+    refuses(UsageError, "good: no folders shard-K-of-N in it; name the folders", _sweep.merge, tmp_path / "good", [])
 
 
 def test_an_array_job_measures_its_part(tmp_path):
@@ -353,8 +352,7 @@ def test_a_line_that_is_no_row_is_named(tmp_path):
     file = _rows.RowFile(tmp_path)
     file.append(ROW)
     file.path.write_bytes(b"[1, 2]\n" + file.path.read_bytes())
-    with pytest.raises(UsageError, match=r"rows\.jsonl: line 1 is no row .* repair or remove that line"):
-        file.read()
+    refuses(UsageError, r"rows\.jsonl: line 1 is no row .* repair or remove that line", file.read)
 
 
 def test_a_folder_is_filled_by_one_process_at_a_time(tmp_path):

@@ -13,6 +13,7 @@ from importlib.metadata import distribution
 from pathlib import Path
 
 import pytest
+from checked import refuses
 from places import ROOT, list_files
 
 import jfrnn
@@ -174,11 +175,9 @@ def test_command_says_which_engines_run():
 
 
 def test_command_refuses_what_it_does_not_know(capsys):
-    with pytest.raises(SystemExit, match="2"):
-        __main__.main(["--versoin"])
+    refuses(SystemExit, "2", __main__.main, ["--versoin"])
     assert "unrecognized arguments: --versoin" in capsys.readouterr().err
-    with pytest.raises(SystemExit, match="0"):
-        __main__.main(["--version"])
+    refuses(SystemExit, "0", __main__.main, ["--version"])
     assert capsys.readouterr().out == f"jfrnn {jfrnn.__version__}\n"
 
 

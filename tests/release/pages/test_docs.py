@@ -8,6 +8,7 @@ import sys
 import pasted
 import pytest
 import soon
+from checked import refuses
 from places import ROOT
 
 import jfrnn
@@ -142,12 +143,10 @@ def test_a_figure_that_is_none_of_the_rows_is_found():
     filled = pages.fill_in(text)
     spoiled = re.sub(r"\d\.\d\d", "0.10", filled, count=1)
     assert spoiled != filled == pages.fill_in(spoiled)
-    with pytest.raises(UsageError, match="there is no such table"):
-        pages.fill_in(text.replace("ties", "knots"))
+    refuses(UsageError, "there is no such table", pages.fill_in, text.replace("ties", "knots"))
     text = "<!-- value jet-steps -->1 000<!-- end -->"
     assert pages.fill_in(text) == text.replace("1 000", pages.VALUES["jet-steps"]()) != text
-    with pytest.raises(UsageError, match="there is no such value"):
-        pages.fill_in(text.replace("jet", "oil"))
+    refuses(UsageError, "there is no such value", pages.fill_in, text.replace("jet", "oil"))
 
 
 def test_no_head_of_a_table_breaks_inside_a_number():

@@ -2,7 +2,7 @@
 
 import re
 
-import pytest
+from checked import refuses
 from places import ROOT
 
 from experiments.pages import gallery
@@ -33,5 +33,4 @@ def test_a_program_that_fails_ends_the_build(tmp_path, monkeypatch):
     assert (tmp_path / "made" / "dots.txt").read_text(encoding="utf-8") == "seven\n"
     assert gallery.run(page, tmp_path / "made") == []
     program.write_text("raise ValueError('no dots')", encoding="utf-8")
-    with pytest.raises(RuntimeError, match="no dots"):
-        gallery.run(page, tmp_path / "made")
+    refuses(RuntimeError, "no dots", gallery.run, page, tmp_path / "made")

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from checked import refuses
 from test_sph_run import write_cube
 
 from jfrnn.cases import fluids
@@ -98,21 +99,18 @@ def turning(center=(0.0, 0.0), rate=1.0):
 def test_a_mistake_in_a_scene_is_named(change, message):
     check_scene(SCENE)
     for act in (check_scene, make_model, make_state):
-        with pytest.raises(SceneError, match=message):
-            act(replace(SCENE, **change))
+        refuses(SceneError, message, act, replace(SCENE, **change))
 
 
 def test_thermal_energies_are_not_below_0():
     about = {name: getattr(SCENE, name) for name in ("name", "positions", "velocities", "masses", "spacing", "duration", "step")}
     gas = fluids.GasScene(**about, energies=np.arange(5.0), physics=fluids.Gas(1.4, 1.3))
     check_scene(gas)
-    with pytest.raises(SceneError, match=r"energies must not be below 0: particle 0 has -1\.0"):
-        check_scene(replace(gas, energies=gas.energies - 1))
+    refuses(SceneError, r"energies must not be below 0: particle 0 has -1\.0", check_scene, replace(gas, energies=gas.energies - 1))
 
 
 def test_what_is_no_scene_is_refused():
-    with pytest.raises(SceneError, match="scene must be a FluidScene or a GasScene, got an array"):
-        make_model(POSITIONS)
+    refuses(SceneError, "scene must be a FluidScene or a GasScene, got an array", make_model, POSITIONS)
 
 
 def test_a_solid_that_lies_beside_the_first_particles_is_taken(tmp_path):
@@ -122,5 +120,4 @@ def test_a_solid_that_lies_beside_the_first_particles_is_taken(tmp_path):
     block = replace(block, physics=replace(PHYSICS, smoothing=0.015, gravity=(0.0, 0.0, -9.81)))
     under = write_cube(tmp_path / "cube.stl", (0.02, 0.02, -0.05), 0.04)
     assert with_solid(block, under).solid.vertices.max(axis=0)[2] == pytest.approx(-0.03)
-    with pytest.raises(SceneError, match=r"reaches from .*; move it there, or name the unit of the file"):
-        with_solid(block, under, 20.0)
+    refuses(SceneError, r"reaches from .*; move it there, or name the unit of the file", with_solid, block, under, 20.0)

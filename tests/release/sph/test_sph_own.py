@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import pyvista
 import trimesh
+from checked import refuses
 from jax.tree_util import Partial
 from places import ROOT
 from test_sph_commands import invoke, read_table
@@ -77,8 +78,7 @@ def test_probes_of_a_lattice():
     force = sph.force_on_walls((0.0, 1.0))(replace(model, force=lambda s: s.x), s._replace(a=s.x - jnp.asarray([1.0, 0.0])))
     np.testing.assert_allclose(force["force"], [2.0, 0.0], atol=1e-12)  # what holds the fluid back is pushed on
     assert force["torque"] == pytest.approx(1.0)
-    with pytest.raises(SceneError, match=r"points must have shape \[k, 2\], got \[2\]"):
-        sph.pressure_at((0.5, 0.5))(model, s)
+    refuses(SceneError, r"points must have shape \[k, 2\], got \[2\]", sph.pressure_at((0.5, 0.5)), model, s)
 
 
 @pytest.mark.parametrize(
@@ -92,8 +92,7 @@ def test_probes_of_a_lattice():
     ],
 )
 def test_a_mistake_in_a_probe_is_named(probe, message):
-    with pytest.raises(SceneError, match=message):
-        probe(sph.make_model(FREE), sph.make_state(FREE))
+    refuses(SceneError, message, probe, sph.make_model(FREE), sph.make_state(FREE))
 
 
 @pytest.mark.parametrize(
@@ -105,8 +104,7 @@ def test_a_mistake_in_a_probe_is_named(probe, message):
     ],
 )
 def test_a_mistake_in_names_of_probes_is_named(tmp_path, probes, message):
-    with pytest.raises(SceneError, match=message):
-        sph.run(FREE, tmp_path / "out", sph.How(pictures=False), probes=probes)
+    refuses(SceneError, message, sph.run, FREE, tmp_path / "out", sph.How(pictures=False), probes=probes)
     assert not (tmp_path / "out").exists()
 
 
@@ -223,8 +221,7 @@ def test_all_snapshots_go_into_one_file_that_paraview_reads(tmp_path, monkeypatc
     ],
 )
 def test_a_mistake_in_how_a_scene_is_run_is_named(told, message):
-    with pytest.raises(SceneError, match=message):
-        sph.How(**told)
+    refuses(SceneError, message, sph.How, **told)
 
 
 @pytest.mark.parametrize(
@@ -276,8 +273,7 @@ def test_a_mistake_in_what_is_written_is_named(tmp_path, more, message):
 )
 def test_a_mistake_in_a_file_is_named(tmp_path, old, new, message):
     (tmp_path / "bath.toml").write_text(BATH.replace(old, new))
-    with pytest.raises(SceneError, match=rf"bath\.toml: {message}"):
-        sph.read_scene(tmp_path / "bath.toml")
+    refuses(SceneError, rf"bath\.toml: {message}", sph.read_scene, tmp_path / "bath.toml")
 
 
 @pytest.mark.parametrize("what", ["fill", "inflow"])
@@ -321,8 +317,7 @@ def test_a_mistake_in_a_mesh_of_a_file_is_named(tmp_path, more, message):
     cube.export(tmp_path / "cube.stl")
     trimesh.Trimesh(cube.vertices, cube.faces[1:]).export(tmp_path / "open.stl")
     (tmp_path / "block.toml").write_text(BLOCK + more)
-    with pytest.raises(SceneError, match=rf"block\.toml: {message}"):
-        sph.read_scene(tmp_path / "block.toml")
+    refuses(SceneError, rf"block\.toml: {message}", sph.read_scene, tmp_path / "block.toml")
 
 
 def test_layers_that_enter_aslant_are_a_spacing_apart(tmp_path):

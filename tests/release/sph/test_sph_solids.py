@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from checked import refuses
 from matplotlib.path import Path as Outline
 from test_sph_commands import invoke, read_table
 
@@ -112,8 +113,7 @@ def test_a_wall_drags_by_the_dynamic_viscosity_of_the_source():
     np.testing.assert_allclose(*found, rtol=1e-6)
     assert np.abs(found[0]).max() > 1.0
     ball = beside(None, np.zeros((1, 3)), viscosity=1.0, viscosity_form="source")
-    with pytest.raises(SceneError, match="pressure and viscosity_form 'source' are forms in 2D"):
-        make_model(ball)
+    refuses(SceneError, "pressure and viscosity_form 'source' are forms in 2D", make_model, ball)
 
 
 SHARP = meshes.gear(6, 200, 1.0, 2.0, 3.0)
@@ -260,8 +260,7 @@ def test_gradients_through_contact():
 )
 def test_what_does_not_go_with_a_solid_is_refused(change, match):
     scene = drop_on_gear(2)
-    with pytest.raises(ValueError, match=match):
-        make_model(replace(scene, physics=replace(scene.physics, **change)))
+    refuses(ValueError, match, make_model, replace(scene, physics=replace(scene.physics, **change)))
 
 
 def test_fluid_in_the_solid_and_open_meshes_are_refused():
@@ -278,8 +277,7 @@ def test_fluid_in_the_solid_and_open_meshes_are_refused():
 def test_fluid_in_a_finely_meshed_solid_is_refused_alike():
     """In the middle of a ball smaller than the cutoff, three times as many triangles are near as anywhere on it."""
     scene = beside(fluids.Solid(*meshes.sphere(0.28, 12)), np.zeros((1, 3)), 0.1)
-    with pytest.raises(SceneError, match=r"positions of the fluid must be outside the solid by 0.1 spacings: particle 0 is not"):
-        make_state(scene)
+    refuses(SceneError, r"positions of the fluid must be outside the solid by 0.1 spacings: particle 0 is not", make_state, scene)
 
 
 @pytest.mark.parametrize("dim", [2, 3])

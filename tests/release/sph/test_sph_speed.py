@@ -7,6 +7,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+from checked import refuses
 from typer.testing import CliRunner
 
 from experiments import _config
@@ -43,8 +44,7 @@ def test_ways_agree_before_their_time_counts_and_the_same_command_goes_on(tmp_pa
 def test_a_config_says_what_is_wrong(tmp_path):
     for text, words in (("ways = ['fast']", r"ways\[0\]: got 'fast'"), ("scene = 'sea'", "unknown fluid scene 'sea'")):
         (tmp_path / "bad.toml").write_text(text)
-        with pytest.raises(UsageError, match=words):
-            _config.load(tmp_path / "bad.toml", speed.Config)
+        refuses(UsageError, words, _config.load, tmp_path / "bad.toml", speed.Config)
     for name in ("sph_speed", "sph_speed_h200"):
         assert _config.load(Path("experiments/configs") / f"{name}.toml", speed.Config).ways
 

@@ -11,7 +11,7 @@ import jax
 import numpy as np
 import pytest
 import warp as wp
-from checked import slow, slowly
+from checked import refuses, slow, slowly
 from places import ROOT, TESTS
 
 import jfrnn
@@ -256,8 +256,7 @@ def test_a_sum_without_translation_is_planned_with_the_array_engine():
 
     plan = jfrnn.memory_plan(100, 0.1, fn=sorts, dim=2)
     assert (plan.backend, plan.sums_bytes) == ("jax", 800)
-    with pytest.raises(NotImplementedError, match="no translation"):
-        jfrnn.memory_plan(100, 0.1, fn=sorts, dim=2, backend="warp")
+    refuses(NotImplementedError, "no translation", jfrnn.memory_plan, 100, 0.1, fn=sorts, dim=2, backend="warp")
 
 
 # --- for all -----------------------------------------------------------------------------------------------------------------
@@ -336,8 +335,7 @@ def test_the_plan_reads_well():
 )
 def test_input_errors(error, match, arguments):
     arguments = {"n": 10, "cutoff": 0.1, "capacity": 8} | arguments
-    with pytest.raises(error, match=match):
-        jfrnn.memory_plan(arguments.pop("n"), arguments.pop("cutoff"), arguments.pop("capacity"), **arguments)
+    refuses(error, match, jfrnn.memory_plan, arguments.pop("n"), arguments.pop("cutoff"), arguments.pop("capacity"), **arguments)
 
 
 def test_float64_without_x64_is_refused():

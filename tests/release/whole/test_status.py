@@ -347,6 +347,5 @@ def test_a_count_that_is_not_known_is_no_number():
     with pytest.raises(ValueError, match=r"needs images=\(3, 3, 3\) in this box as it is now, and here images=\(1, 1, 1\)"):
         jfrnn.count(x, 6.0, box=jfrnn.Box(cell, images=1))
     refuses(ValueError, r"needs images=\(3, 3, 3\)", jfrnn.pair_sum, one, x, 6.0, box=jfrnn.Box(cell, images=1))
-    with pytest.raises(ValueError, match=r"needs images=\(3, 3, 3\)"):
-        jfrnn.search(x, 6.0, box=jfrnn.Box(cell, images=1), capacity=80).check()
+    refuses(ValueError, r"needs images=\(3, 3, 3\)", jfrnn.search(x, 6.0, box=jfrnn.Box(cell, images=1), capacity=80).check)
     assert re.search("images_for", Status.BOX_TOO_SMALL.message)
