@@ -7,10 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import typer
-from typer.testing import CliRunner
+from commanded import invoke, refused, told
 
 from experiments import _commands, _config
-from experiments._cli import app
 from experiments._errors import UsageError
 from experiments.bench.gpu import Config
 
@@ -23,25 +22,6 @@ BENCH = (
 )
 SPH = ("validate", "speed", "gradients", "peers")
 COMMANDS = (*TOP[:8], "gpu", *(f"bench {name}" for name in BENCH), *(f"sph {name}" for name in SPH))
-
-
-def refused(*arguments):
-    """Run a command that is refused, in this process; return what it says, a line, without the "error: "."""
-    result = CliRunner().invoke(app, [str(argument) for argument in arguments], prog_name="python -m experiments")
-    if result.exit_code != 2:
-        raise AssertionError(f"exit code {result.exit_code}: {result.output}") from result.exception
-    assert result.stdout == ""
-    assert result.stderr.startswith("error: ")
-    assert result.stderr.count("\n") == 1, result.stderr
-    return result.stderr.removeprefix("error: ").rstrip("\n")
-
-
-def told(*arguments):
-    result = CliRunner().invoke(
-        app, [str(argument) for argument in arguments], catch_exceptions=False, prog_name="python -m experiments"
-    )
-    assert result.exit_code == 0
-    return result.stdout
 
 
 # --- lists and help ---------------------------------------------------------------------------------------------------------
@@ -101,11 +81,17 @@ def test_list_says_what_there_is():
         (("show", "corners", "--fill", "nan"), "--fill nan: "),
         (("show", "corners", "--seed", "-1"), "--seed -1: "),
         (("show", "corners", "--spacing", "1e-3", "--out", "p.abc"), "--out p.abc: unknown ending '.abc'; allowed: "),
-        (("sph", "validate", "sea"), "no case 'sea'; allowed: "),
-        (("sph", "gradients", "sea"), "no problem 'sea'; allowed: "),
+        (("bench", "crystals", "--sizes", "3"), "Invalid value for --sizes: 3: say systems x atoms of each"),
+        (("sph", "validate", "sea"), "no case 'sea'; allowed: one, two, three, four, taylor-green"),
+        (("sph", "gradients", "sea"), "no problem 'sea'; allowed: viscosity, jet, droplet, memory"),
         (("sph", "gradients", "--evaluations", "0"), "--evaluations 0: "),
         (("run", "none.toml", "--most-seconds", "nan"), "--most-seconds nan: "),
+        (("run", "none.toml", "--most-seconds", "0"), "--most-seconds 0: 0.0 is not in the range x>0."),
         (("run", "none.toml", "--processes", "0"), "--processes 0: "),
+        *(
+            (("run", "none.toml", "--shard", part), f"--shard {part}: expected K/N with 1 <= K <= N, such as 2/8")
+            for part in ("3/2", "0/2", "2", "a/b")
+        ),
         (("export", "corners", "--out", "points.xyz"), "--out points.xyz: unknown ending '.xyz'; allowed: .csv, .vtp, .vtk"),
         (("export", "corner", "--out", "points.csv"), "unknown layout 'corner'; allowed: full, corners, diagonal, "),
         (("show", "clusters0"), "unknown layout 'clusters0'; allowed: full, "),
@@ -132,11 +118,11 @@ def test_configs_that_are_none(tmp_path, command):
     assert refused(*command.split(), tmp_path, "--out", tmp_path / "out").startswith(f"{tmp_path}: cannot be read (Is a directory)")
     for name, text in BROKEN.items():
         (tmp_path / name).write_bytes(text)
-        said = CliRunner().invoke(app, [*command.split(), str(tmp_path / name), "--out", str(tmp_path / "out")])
-        assert said.exit_code == 2
-        assert all(line.startswith(("error: ", str(tmp_path / name))) for line in said.stderr.splitlines())
-        assert str(tmp_path / name) in said.stderr.splitlines()[0]
-    assert "speed: unknown key (value 1); allowed: " in said.stderr
+        code, _, said = invoke(*command.split(), tmp_path / name, "--out", tmp_path / "out")
+        assert code == 2
+        assert all(line.startswith(("error: ", str(tmp_path / name))) for line in said.splitlines())
+        assert str(tmp_path / name) in said.splitlines()[0]
+    assert "speed: unknown key (value 1); allowed: " in said
     assert not (tmp_path / "out").exists()
 
 

@@ -2,22 +2,13 @@ import numpy as np
 import pytest
 import pyvista
 import reference
+from commanded import told
 from matplotlib.image import imread
-from typer.testing import CliRunner
 
 from experiments import _show
-from experiments._cli import app
 from jfrnn import cases
 
 SPACING = 5e-4
-
-
-def invoke(*arguments):
-    """Run a command in this process; return its exit code, stdout and stderr."""
-    result = CliRunner().invoke(app, [str(argument) for argument in arguments])
-    if result.exit_code not in (0, 2):
-        raise result.exception
-    return result.exit_code, result.stdout, result.stderr
 
 
 @pytest.fixture
@@ -27,7 +18,7 @@ def scene(dim, dtype):
 
 def export(path, scene, *options):
     common = ("--fill", 0.3, "--spacing", SPACING, "--dim", scene.dim, "--dtype", scene.positions.dtype)
-    assert invoke("export", "clusters2", "--out", path, *common, *options) == (0, f"{path}\n", "")
+    assert told("export", "clusters2", "--out", path, *common, *options) == f"{path}\n"
 
 
 def test_csv_reads_back_the_same_floats(tmp_path, scene):
@@ -65,7 +56,7 @@ def test_counts_are_stored_on_demand(tmp_path, scene):
 @pytest.mark.parametrize("options", [("--dim", 2), ("--dim", 3), ("--fill", 0.02)], ids=["2d", "3d", "fill"])
 def test_show_draws_the_points(tmp_path, options):
     path = tmp_path / "new" / "corners.png"
-    assert invoke("show", "corners", "--spacing", SPACING, "--out", path, *options) == (0, f"{path}\n", "")
+    assert told("show", "corners", "--spacing", SPACING, "--out", path, *options) == f"{path}\n"
     picture = (255 * imread(path)[..., :3]).round().astype(int)
     assert min(picture.shape[:2]) >= 900
     for color in (_show.COLOR, _show.RING_COLOR):

@@ -9,12 +9,11 @@ import jax
 import numpy as np
 import pytest
 from checked import refuses
+from commanded import invoke, told
 from places import ROOT
-from typer.testing import CliRunner
 
 import jfrnn
 from experiments import _config
-from experiments._cli import app
 from experiments._errors import UsageError
 from experiments.bench import decisions, gpu, lists
 
@@ -127,12 +126,11 @@ def test_the_command_decides_triangles_and_a_wrong_list_ends_it_with_1(tmp_path,
     (tmp_path / "one.toml").write_text(part)
 
     def run(out):
-        done = CliRunner().invoke(app, ["gpu", str(tmp_path / "one.toml"), "--out", str(tmp_path / out)], catch_exceptions=False)
-        return done.exit_code, done.stdout.split(";")[0]
+        code, said, _ = invoke("gpu", tmp_path / "one.toml", "--out", tmp_path / out)
+        return code, said.split(";")[0]
 
     assert run("right") == (0, "0 wrong")
-    text = CliRunner().invoke(app, ["report", str(tmp_path / "right")]).stdout
-    assert "jfrnn warp, triangles" in text
+    assert "jfrnn warp, triangles" in told("report", tmp_path / "right")
     search = jfrnn.search_triangles
     monkeypatch.setattr(jfrnn, "search_triangles", lambda x, v, f, cutoff, **options: search(x, v, f, 1.5 * cutoff, **options))
     assert run("wrong") == (1, "1 wrong")
@@ -157,8 +155,7 @@ def test_report_of_a_run(tmp_path):
         {**call, "method": "another", "reason": "not installed"},
     ]
     (tmp_path / "rows.jsonl").write_text("\n".join(json.dumps(row | about) for row in rows))
-    result = CliRunner().invoke(app, ["report", str(tmp_path)], catch_exceptions=False)
-    assert [line.split() for line in result.stdout.splitlines()] == [
+    assert [line.split() for line in told("report", tmp_path).splitlines()] == [
         *(["exactness"], ["method", "cases", "wrong", "device"], ["jfrnn", "warp", "2", "0", "some", "GPU"], []),
         *(["call"], ["method", "device", "layout", "points", "directed_pairs", "median_s", "reason"]),
         ["jfrnn", "warp", "some", "GPU", "jitter", "1000", "5", "0.001"],

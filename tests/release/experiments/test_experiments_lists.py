@@ -1,14 +1,13 @@
-"""What benches of lists share: ways that are right are timed, and nothing wrong is."""
+"""Benches of lists, and what they share: ways that are right are timed, and nothing wrong is."""
 
 import jax
 import numpy as np
 import pandas as pd
 import pytest
-from typer.testing import CliRunner
+from commanded import told
 
 from experiments import methods
-from experiments._cli import app
-from experiments.bench import arrays, crystals, latency, lists, table
+from experiments.bench import arrays, crystals, latency, lists, structures, table
 
 N = 16
 SUMS = ("list", "counts", "density", "density, gradient")
@@ -31,11 +30,10 @@ WAYS = {  # of each bench: its options, who does what, and times
 @pytest.mark.filterwarnings("ignore")  # of other libraries
 def test_every_way_gets_a_row_and_none_twice(tmp_path, foreign, bench):
     options, whats, times = WAYS[bench]
-    words = ["bench", bench, *options, "--repeats", "2", "--out", str(tmp_path)]
-    result = CliRunner().invoke(app, words)
-    assert result.exit_code == 0, result.output
+    words = ("bench", bench, *options, "--repeats", 2, "--out", tmp_path)
+    said = told(*words)
     rows = (tmp_path / "rows.jsonl").read_bytes()
-    assert CliRunner().invoke(app, words).stdout == result.stdout
+    assert told(*words) == said
     assert (tmp_path / "rows.jsonl").read_bytes() == rows
     found = pd.read_csv(tmp_path / "cpu.csv")
     assert tuple(found["what"]) == whats
@@ -50,9 +48,6 @@ def test_every_way_gets_a_row_and_none_twice(tmp_path, foreign, bench):
 
 
 def test_a_size_is_systems_and_atoms():
-    result = CliRunner().invoke(app, ["bench", "crystals", "--sizes", "3"])
-    assert result.exit_code == 2
-    assert "say systems x atoms of each" in result.output
     assert crystals._read_size("256x100") == (256, 100)
 
 
@@ -99,3 +94,27 @@ def test_a_wrong_list_is_seen():
     tied = idx.copy()
     tied[9, 0] = np.flatnonzero(distances[9] == 3)[0]
     assert lists.wrong_rows(scene, (tied, None)) == 3
+
+
+@pytest.mark.filterwarnings("ignore")  # of other libraries
+def test_every_library_gets_its_rows(tmp_path, foreign):
+    """`bench structures`: those that are there found the same pairs."""
+    told("bench", "structures", "--count", 4, "--repeats", 20, "--out", tmp_path)
+    rows = pd.read_csv(tmp_path / "cpu.csv")
+    assert sorted(rows["who"]) == sorted([*structures.LIBRARIES * 2, "jfrnn"])
+    done = rows[rows["status"] == "ok"]
+    assert set(done["who"]) >= {"jfrnn"}
+    assert (done.groupby(done["atoms"].fillna(0))["pairs"].nunique() == 1).all()
+
+
+@pytest.mark.slow  # thirty programs
+def test_every_kind_of_sites_gets_a_row_that_was_checked(tmp_path):
+    """`bench ties`: lattices beside the same scenes moved at random, each count compared with the oracle."""
+    told("bench", "ties", "--cube", 1000, "--rounds", 2, "--out", tmp_path)
+    found = pd.read_csv(tmp_path / "cpu_warp.csv")
+    assert len(found) == 2 * 5
+    assert (found["wrong"] == 0).all()
+    assert (found["checked"] == 1000).all()
+    whole = found[found["sites"].isin(["spacing 1", "spacing 1/64"])]["neighbors"]
+    assert whole.nunique() == 1  # strictly less: no tie is a pair
+    assert (found[["count_s", "list_s", "density_s"]] > 0).all(axis=None)

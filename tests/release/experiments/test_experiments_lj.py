@@ -6,11 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import pytest
-from typer.testing import CliRunner
+from commanded import told
 
 import jfrnn
 from experiments import methods
-from experiments._cli import app
 from experiments.bench import lj, lj_peers
 from experiments.pages import liquid as tables
 
@@ -76,9 +75,7 @@ def test_the_potential_goes_to_zero_smoothly():
 @pytest.mark.filterwarnings("ignore")  # of jax-md
 def test_rows(monkeypatch, tmp_path, foreign):
     monkeypatch.setattr(lj, "SKINS", (0.2, 0.3))
-    given = ["bench", "lj", "--sizes", "343", "--steps", "3", "--repeats", "1", "--out", str(tmp_path)]
-    result = CliRunner().invoke(app, given)
-    assert result.exit_code == 0, result.output
+    told("bench", "lj", "--sizes", 343, "--steps", 3, "--repeats", 1, "--out", tmp_path)
     table = pd.read_csv(tmp_path / "cpu.csv")
     assert list(table["who"]) == [*lj.WAYS, *lj_peers.PEERS]
     for row in table.to_dict("records"):

@@ -5,9 +5,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from typer.testing import CliRunner
+from commanded import told
 
-from experiments._cli import app
 from experiments.bench import options, options_scenes
 
 POINTS = 512
@@ -40,9 +39,7 @@ def neighbors(asked: options_scenes.Asked) -> np.ndarray:
 def test_options_get_rows(tmp_path, monkeypatch):
     every = all_of()
     monkeypatch.setattr(options, "options", lambda: [every[name] for name in CHOSEN])
-    given = ["--points", str(POINTS), "--rounds", "2", "--backend", "warp", "--out", str(tmp_path)]
-    result = CliRunner().invoke(app, ["bench", "options", *given])
-    assert result.exit_code == 0, result.output
+    told("bench", "options", "--points", POINTS, "--rounds", 2, "--backend", "warp", "--out", tmp_path)
     of: Any = pd.read_csv(tmp_path / "cpu_warp.csv").set_index("option")
     assert list(of.index) == list(CHOSEN)
     assert (of["status"] == "ok").all(), of["reason"]

@@ -4,9 +4,8 @@ import csv
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
+from commanded import told
 
-from experiments._cli import app
 from experiments.bench import peers
 from jfrnn.cases.catalog import CATALOG, TABLES, problem
 
@@ -24,8 +23,7 @@ def test_answers_are_judged_and_tabled(tmp_path, monkeypatch):
     kept = {"hard/integers_9", "periodic/flat", "batches/far_apart"}
     rows = [row._replace(cases=tuple(case for case in row.cases if case in kept)) for row in CATALOG]
     monkeypatch.setattr(peers, "CATALOG", tuple(row for row in rows if row.cases))
-    result = CliRunner().invoke(app, ["bench", "peers", "jfrnn", "scipy", "--out", str(tmp_path)])
-    assert result.exit_code == 0, result.output
+    said = told("bench", "peers", "jfrnn", "scipy", "--out", tmp_path)
     with (tmp_path / "answers.csv").open() as stream:
         answers = {(row["peer"], row["case"]): row for row in csv.DictReader(stream)}
     assert {row["answer"] for (peer, _), row in answers.items() if peer == "jfrnn"} == {"right"}
@@ -33,8 +31,8 @@ def test_answers_are_judged_and_tabled(tmp_path, monkeypatch):
     assert (ties["answer"], ties["missing"]) == ("right, closed", "0")
     assert int(ties["extra"]) > 0
     assert answers["scipy", "periodic/flat"]["answer"] == "no skewed boxes"
-    assert "| left-handed and skewed boxes | right | no skewed boxes |" in result.output
-    assert "| batches | right | not asked |" in result.output
+    assert "| left-handed and skewed boxes | right | no skewed boxes |" in said
+    assert "| batches | right | not asked |" in said
 
 
 def _stop(given):

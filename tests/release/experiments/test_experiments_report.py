@@ -6,11 +6,10 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from commanded import refused, told
 from matplotlib.image import imread
-from typer.testing import CliRunner
 
 from experiments import _look, _plots, _report, _table, _thesis
-from experiments._cli import app
 from experiments._rows import RowFile, SearchRow, values_of
 
 PICTURES = ("runtime_by_layout", "memory_by_layout", "runtime_by_fill", "memory_by_fill", "speed_against_error")
@@ -57,9 +56,7 @@ def reported(tmp_path_factory):
     folder = tmp_path_factory.mktemp("reported")
     for row in reversed(make_rows()):
         RowFile(folder).append(row)
-    result = CliRunner().invoke(app, ["report", str(folder)], catch_exceptions=False)
-    assert result.exit_code == 0
-    return folder, result.stdout
+    return folder, told("report", folder)
 
 
 def read_table(folder):
@@ -141,8 +138,7 @@ def test_printed_table_fits_80_columns_and_names_what_is_not_installed_in_one_li
         lost = {"status": "missing", "reason": "not there", "median_s": None, "points": None}
         RowFile(tmp_path).append(row if number == 0 else replace(row, **lost))
         RowFile(tmp_path).append(replace(row, key=f"{method}, turned", layout="turned4", angle=45.0, order="shuffled"))
-    result = CliRunner().invoke(app, ["report", str(tmp_path)], catch_exceptions=False)
-    lines = result.stdout.splitlines()
+    lines = told("report", tmp_path).splitlines()
     start = lines.index(next(line for line in lines if "missing" in line))
     end = lines.index(next(line for line in lines if line.startswith("not installed: ")))
     table = [line.rstrip() for line in lines[start:end]]
@@ -262,8 +258,7 @@ def test_origin_names_all_that_differ():
 
 def test_a_sweep_of_one_unknown_method_on_one_scene(tmp_path):
     RowFile(tmp_path).append(make_row(("random", 0.3, 500, 0.3), "peer", 0.5, 1.0))
-    result = CliRunner().invoke(app, ["report", str(tmp_path)], catch_exceptions=False)
-    assert result.exit_code == 0
+    told("report", tmp_path)
     line = read_table(tmp_path)["random 30 %", "peer"]
     assert (line["median_s"], line["seconds_ratio"], line["thesis_s"]) == ("0.5", "", "")
     assert all((tmp_path / f"{name}.png").exists() for name in PICTURES)
@@ -271,24 +266,20 @@ def test_a_sweep_of_one_unknown_method_on_one_scene(tmp_path):
 
 def test_a_sweep_without_figures_still_has_its_table(tmp_path):
     RowFile(tmp_path).append(make_row(SCENES[0], "cll", 0, 0, status="missing", reason="not there", median_s=None, points=None))
-    result = CliRunner().invoke(app, ["report", str(tmp_path)], catch_exceptions=False)
-    assert result.exit_code == 0
+    said = told("report", tmp_path)
     assert list(tmp_path.glob("*.png")) == []
-    assert "not installed: cll (make peers; " in result.stdout and "not there" not in result.stdout
+    assert "not installed: cll (make peers; " in said and "not there" not in said
 
 
 @pytest.mark.parametrize(("cores", "mark"), [(None, "°"), (0.1, ""), (0.4, "*")])
 def test_times_are_marked_beside_others_and_where_that_is_not_known(tmp_path, monkeypatch, cores, mark):
     monkeypatch.setattr(_plots, "draw_all", lambda rows, folder, origin: [])
     RowFile(tmp_path).append(make_row(SCENES[0], "cll", 0.25, 10.0, others_cores=cores))
-    result = CliRunner().invoke(app, ["report", str(tmp_path)], catch_exceptions=False)
-    assert f" {mark}0.2500 " in result.stdout
+    assert f" {mark}0.2500 " in told("report", tmp_path)
 
 
 def test_a_folder_without_rows(tmp_path):
-    result = CliRunner().invoke(app, ["report", str(tmp_path)])
-    assert result.exit_code == 2
-    assert result.stderr.startswith(f"error: {tmp_path}: no rows; fill it with `python -m experiments run CONFIG.toml --out")
+    assert refused("report", tmp_path).startswith(f"{tmp_path}: no rows; fill it with `python -m experiments run CONFIG.toml --out")
 
 
 def test_without_memory_there_are_no_pictures_of_it(tmp_path, monkeypatch):

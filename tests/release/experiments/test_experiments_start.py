@@ -2,9 +2,8 @@
 
 import pandas as pd
 import pytest
-from typer.testing import CliRunner
+from commanded import told
 
-from experiments._cli import app
 from experiments.bench import guides, start
 
 
@@ -12,8 +11,7 @@ from experiments.bench import guides, start
 def test_rows_of_fresh_processes(monkeypatch, tmp_path, what):
     monkeypatch.setattr(start, "WHAT", what)
     monkeypatch.setenv("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # as the command sets it
-    result = CliRunner().invoke(app, ["bench", "start", "--repeats", "1", "--out", str(tmp_path)])
-    assert result.exit_code == 0, result.output
+    said = told("bench", "start", "--repeats", 1, "--out", tmp_path)
     table = pd.read_csv(tmp_path / "start_cpu.csv")
     assert list(zip(table["what"], table["cache"])) == [(each, cache) for each in what for cache in ("cold", "warm")]
     assert (table["status"] == "ok").all(), table["reason"]
@@ -21,7 +19,7 @@ def test_rows_of_fresh_processes(monkeypatch, tmp_path, what):
     assert (table[["wait_s", *start.PARTS]] > 0).all(axis=None)
     assert (table["wait_s"] < table["process_s"]).all()
     assert (table.groupby("what")["answer"].nunique() == 1).all()
-    assert result.stdout.split()[:3] == ["what", "cache", "who"]
+    assert said.split()[:3] == ["what", "cache", "who"]
 
 
 def test_a_process_that_fails_says_why(tmp_path):
@@ -51,8 +49,7 @@ def test_guides_are_run_and_what_they_compile_is_counted(monkeypatch, tmp_path):
         "```python\nimport jfrnn\n\nn = jfrnn.count([[0.0, 0.0]], 1.0)\n```\n\n```python\nassert n[0] == 0\n```\n"
     )
     monkeypatch.setattr(guides, "GUIDES", tmp_path)
-    result = CliRunner().invoke(app, ["bench", "guides", "--out", str(tmp_path)])
-    assert result.exit_code == 0, result.output
+    told("bench", "guides", "--out", tmp_path)
     table = pd.read_csv(tmp_path / "guides_cpu.csv")
     assert list(zip(table["guide"], table["cache"], table["status"])) == [("one", "cold", "ok"), ("one", "warm", "ok")]
     assert table["programs"].nunique() == 1 and (table["programs"] > 0).all() and (table["kernels"] > 0).all()

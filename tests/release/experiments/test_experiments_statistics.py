@@ -5,11 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 import pytest
+from commanded import told
 from test_experiments_report import SCENES, make_row
-from typer.testing import CliRunner
 
 from experiments import _report, _statistics, _table
-from experiments._cli import app
 from experiments._rows import RowFile, read_latest
 
 
@@ -112,7 +111,7 @@ def test_pandas_reads_the_table(tmp_path):
     skipped = make_row(SCENES[0], "brute", 0, 0, status="skipped", reason="x")
     for row in [*rounds("cll", [1.0, 1.2]), *rounds("jax", [2.0, 2.2]), skipped]:
         RowFile(tmp_path).append(row)
-    assert CliRunner().invoke(app, ["report", str(tmp_path)], catch_exceptions=False).exit_code == 0
+    told("report", tmp_path)
     table = pd.read_csv(tmp_path / "table.csv")
     assert list(table.columns) == list(_table.COLUMNS)
     assert table.set_index("method").loc["cll", "median_s"] == pytest.approx(1.1)

@@ -6,12 +6,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from checked import refuses
+from commanded import told
 from places import ROOT
-from typer.testing import CliRunner
 
 import jfrnn
 from experiments import _config
-from experiments._cli import app
 from experiments._errors import UsageError
 from experiments.bench import sums, ways
 
@@ -38,9 +37,7 @@ def folder(tmp_path_factory):
     """Run the command once; its folder holds the config, too."""
     there = tmp_path_factory.mktemp("sums")
     (there / "tiny.toml").write_text(TINY)
-    result = CliRunner().invoke(app, ["bench", "sums", str(there / "tiny.toml"), "--out", str(there)], catch_exceptions=False)
-    assert result.exit_code == 0, result.output
-    (there / "said.txt").write_text(result.output)
+    (there / "said.txt").write_text(told("bench", "sums", there / "tiny.toml", "--out", there))
     return there
 
 

@@ -4,9 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from experiments._cli import app
 from experiments.sph import gradients, inverse
 
 
@@ -54,9 +52,3 @@ def test_a_descent_keeps_what_it_tried():
     assert list(frame["known"]) == [0.0, 1.0, 2.0]
     assert gradients.draw(problem, found).get_suptitle().startswith("bowl: ")
     assert jax.config.jax_enable_x64
-
-
-def test_unknown_problems_are_refused(tmp_path):
-    result = CliRunner().invoke(app, ["sph", "gradients", "sea", "--out", str(tmp_path)])
-    assert result.exit_code == 2
-    assert "no problem 'sea'; allowed: viscosity, jet, droplet, memory" in result.stderr

@@ -8,10 +8,9 @@ import jax
 import numpy as np
 import pytest
 from checked import refuses
-from typer.testing import CliRunner
+from commanded import told
 
 from experiments import _config
-from experiments._cli import app
 from experiments._errors import UsageError
 from experiments.sph import speed
 from jfrnn.cases import fluids
@@ -20,9 +19,7 @@ from jfrnn.sph.model import make_model, make_state
 
 
 def run(folder):
-    words = ["sph", "speed", str(folder / "tiny.toml"), "--out", str(folder)]
-    result = CliRunner().invoke(app, words, catch_exceptions=False)
-    assert result.exit_code == 0, result.output
+    told("sph", "speed", folder / "tiny.toml", "--out", folder)
     return [json.loads(line) for line in (folder / "rows.jsonl").read_text().splitlines()]
 
 
