@@ -19,8 +19,8 @@ def told(*words, **environment):
     return out
 
 
-def refused(*words):
+def refused(*words, by=invoke):
     """Run a command that is refused; return what it says, a line, without the "error: "."""
-    code, out, err = invoke(*words)
+    code, out, err = by(*words)
     assert (code, out, err[:7], err.count("\n")) == (2, "", "error: ", 1), out + err
     return err.removeprefix("error: ").rstrip("\n")

@@ -5,16 +5,14 @@ from dataclasses import replace
 import jax
 import numpy as np
 import pytest
+from checked import slow
+from poured import changed
 
 from jfrnn.cases import fluids
 from jfrnn.sph import budget, solver, states
 from jfrnn.sph.model import make_model, make_state
 
 DROP = fluids.fluid("drop", nx=6, duration=0.003)
-
-
-def changed(scene, **physics):
-    return replace(scene, physics=replace(scene.physics, **physics))
 
 
 def run(scene, steps):
@@ -31,9 +29,7 @@ def energy(model, s):
     return float(budget.kinetic_energy(model, s) + budget.potential_energy(model, s) + budget.internal_energy(model, s))
 
 
-@pytest.mark.parametrize(
-    "form", ["symmetric", pytest.param("mean", marks=pytest.mark.slow), pytest.param("volume", marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize("form", ["symmetric", slow("mean"), slow("volume")])
 def test_momentum_is_kept_to_rounding(form):
     uneven = replace(DROP, velocities=DROP.velocities + np.random.default_rng(0).normal(size=DROP.velocities.shape) * 20.0)
     model, before, after = run(changed(uneven, pressure=form, tension=1e4), 100)

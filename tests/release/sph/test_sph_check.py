@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from checked import refuses
+from poured import scene_of
 from test_sph_run import write_cube
 
 from jfrnn.cases import fluids
@@ -13,16 +14,7 @@ from jfrnn.sph.errors import SceneError
 
 PHYSICS = fluids.Physics(density=1000.0, sound_speed=10.0, smoothing=0.15, gravity=(0.0, -9.81))
 POSITIONS = np.random.default_rng(0).random((5, 2))
-SCENE = fluids.FluidScene(
-    name="own",
-    positions=POSITIONS,
-    velocities=np.zeros((5, 2)),
-    masses=np.ones(5),
-    spacing=0.1,
-    duration=1.0,
-    step=None,
-    physics=PHYSICS,
-)
+SCENE = scene_of(POSITIONS, 0.1, PHYSICS)
 BOX = fluids.Tank((0.0, 0.0), (1.0, 1.0))
 CORNERS, SIDES = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]), np.array([[0, 1], [1, 2], [2, 0]])
 

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from checked import refuses
+from poured import changed
 
 import jfrnn
 from experiments.sph import answers
@@ -115,7 +116,7 @@ def test_a_tank_at_rest_has_hydrostatic_pressure():
 @pytest.mark.slow
 def test_damping_ends():
     scene = fluids.fluid("one", duration=0.2)
-    scene = replace(scene, physics=replace(scene.physics, gravity=None, damping=20.0, damped_until=0.1), velocities=np.ones((1, 2)))
+    scene = changed(replace(scene, velocities=np.ones((1, 2))), gravity=None, damping=20.0, damped_until=0.1)
     assert np.asarray(run(scene, time=0.1, backend="brute")[1].v) == pytest.approx(np.exp(-2.0), rel=2e-3)
     assert np.asarray(run(scene, backend="brute")[1].v) == pytest.approx(np.exp(-2.0), rel=2e-3)
 
@@ -146,8 +147,7 @@ def test_a_jet_enters_layer_by_layer():
 @pytest.mark.slow
 @pytest.mark.parametrize("integrator", ["symplectic", "midpoint"])
 def test_lists_and_pair_sums_agree(integrator):
-    scene = fluids.fluid("taylor-green", nx=12, jitter=0.2)
-    scene = replace(scene, physics=replace(scene.physics, integrator=integrator))
+    scene = changed(fluids.fluid("taylor-green", nx=12, jitter=0.2), integrator=integrator)
     model, s = begun(scene)
     nbrs = solver.list_neighbors(model, s, skin=0.2 * scene.spacing)
     assert isinstance(nbrs, jfrnn.NeighborList)
@@ -165,8 +165,8 @@ def test_symplectic_and_midpoint_converge_to_each_other():
     found = {}
     for integrator in ("symplectic", "midpoint"):
         for step in (4e-4, 2e-4):
-            changed = replace(scene, step=step, physics=replace(scene.physics, integrator=integrator))
-            found[integrator, step] = np.asarray(run(changed, time=0.02)[1].v)
+            other = changed(replace(scene, step=step), integrator=integrator)
+            found[integrator, step] = np.asarray(run(other, time=0.02)[1].v)
     coarse, fine = (np.abs(found["symplectic", step] - found["midpoint", step]).max() for step in (4e-4, 2e-4))
     assert fine < 0.6 * coarse
     assert fine < 1e-3

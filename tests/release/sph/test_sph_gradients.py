@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from poured import changed, scene_of
 
 from jfrnn.cases import fluids
 from jfrnn.sph import solver
@@ -13,26 +14,15 @@ from jfrnn.sph.model import make_model, make_state
 
 RANDOM = np.random.default_rng(0)
 SITES = np.stack(np.meshgrid(np.arange(6.0), np.arange(6.0)), axis=-1).reshape(-1, 2) / 6
-BLOB = fluids.FluidScene(
-    name="blob",
-    positions=SITES + 0.02 * RANDOM.normal(size=SITES.shape),
-    velocities=0.3 * RANDOM.normal(size=SITES.shape),
-    masses=np.full(len(SITES), 1 / 36),
-    spacing=1 / 6,
-    duration=1.0,
-    step=2e-3,
-    physics=fluids.Physics(density=1.0, sound_speed=5.0, smoothing=0.2, state="linear", viscosity=0.1),
-)
+PLACES, SPEEDS = SITES + 0.02 * RANDOM.normal(size=SITES.shape), 0.3 * RANDOM.normal(size=SITES.shape)
+PHYSICS = fluids.Physics(density=1.0, sound_speed=5.0, smoothing=0.2, state="linear", viscosity=0.1)
+BLOB = scene_of(PLACES, 1 / 6, PHYSICS, velocities=SPEEDS, step=2e-3)
 
 
 def stirred(scene):
     """Return a scene whose fluid moves at random: at rest, artificial viscosity and bounces have kinks."""
     v = 0.1 * scene.physics.sound_speed * np.random.default_rng(1).normal(size=scene.velocities.shape)
     return replace(scene, velocities=scene.velocities + (v if scene.wall is None else v * ~scene.wall[:, None]))
-
-
-def changed(scene, **physics):
-    return replace(scene, physics=replace(scene.physics, **physics))
 
 
 def make_loss(scene, steps, segments, name, backend="brute", skin=None):

@@ -13,6 +13,7 @@ import trimesh
 from checked import refuses
 from jax.tree_util import Partial
 from places import ROOT
+from poured import changed, scene_of
 from test_sph_commands import invoke, read_table
 from vtkmodules.vtkIOHDF import vtkHDFReader
 
@@ -23,16 +24,9 @@ from jfrnn.sph.errors import SceneError
 from jfrnn.sph.particles import mass_there
 
 FEW = np.array([[0.0, 0.0], [10.0, 0.0], [0.0, 20.0]])  # none is near another
-FREE = sph.FluidScene(
-    name="free",
-    positions=FEW,
-    velocities=np.array([[1.0, 0.0], [0.0, 0.0], [0.0, -1.0]]),
-    masses=np.array([1.0, 2.0, 4.0]),
-    spacing=0.1,
-    duration=0.5,
-    step=0.01,
-    physics=sph.Physics(density=1.0, sound_speed=1.0, smoothing=0.15, pressure="mean", integrator="symplectic"),
-)
+PHYSICS = sph.Physics(density=1.0, sound_speed=1.0, smoothing=0.15, pressure="mean", integrator="symplectic")
+GIVEN = {"velocities": np.array([[1.0, 0.0], [0.0, 0.0], [0.0, -1.0]]), "masses": np.array([1.0, 2.0, 4.0])}
+FREE = scene_of(FEW, 0.1, PHYSICS, name="free", duration=0.5, step=0.01, **GIVEN)
 
 
 def spring(stiffness, s):
@@ -70,7 +64,7 @@ def test_probes_of_a_lattice():
     dx = 0.1
     x = sph.lattice((0.0, 0.0), (10, 10), dx)
     scene = replace(FREE, positions=x, velocities=x * 0 + [3.0, 4.0], masses=np.full(100, 2 * dx**2))
-    scene = replace(scene, physics=replace(FREE.physics, density=2.0, state="linear"), densities=2.0 + 0.01 * x[:, 1])
+    scene = changed(replace(scene, densities=2.0 + 0.01 * x[:, 1]), density=2.0, state="linear")
     model, s = sph.make_model(scene, backend="brute"), sph.make_state(scene)
     np.testing.assert_allclose(sph.pressure_at([(0.5, 0.5), (9.0, 9.0)])(model, s), [0.005, 0.0], atol=1e-6)
     assert sph.flow_through((0.5, 0.0), (2.0, 0.0), 4 * dx)(model, s) == pytest.approx(2 * 1.0 * 3.0)

@@ -6,6 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from checked import slow
+from poured import changed
 
 from jfrnn.cases import fluids
 from jfrnn.sph import correction, density, pressure, solver, states, surface, transport, viscosity, walls
@@ -46,35 +48,19 @@ def make_pair(r, name="quintic"):
     return Pair(jnp.asarray(r), KERNELS[name], 0.1)
 
 
+def particle(m, rho, p, v, w, even, mean):
+    """Return what terms read of a particle, whose transport velocity is that of the fluid."""
+    given = {"m": m, "rho": rho, "specific": 1 / rho, "volume": m / rho, "p": p, "v": v, "u": v, "w": w, "even": even, "mean": mean}
+    return {name: np.asarray(value) for name, value in given.items()}
+
+
 VALUES = (
-    {
-        "m": 1.1,
-        "rho": 900.0,
-        "specific": 1 / 900,
-        "volume": 1.1 / 900,
-        "p": 20.0,
-        "v": [0.1, 0.3],
-        "u": [0.1, 0.3],
-        "w": [0.02, 0.0],
-        "even": 1.1,
-        "mean": 7.0,
-    },
-    {
-        "m": 1.4,
-        "rho": 1100.0,
-        "specific": 1 / 1100,
-        "volume": 1.4 / 1100,
-        "p": -5.0,
-        "v": [-0.4, 0.2],
-        "u": [-0.4, 0.2],
-        "w": [0.0, -0.01],
-        "even": 0.9,
-        "mean": 4.0,
-    },
+    particle(1.1, 900.0, 20.0, [0.1, 0.3], [0.02, 0.0], 1.1, 7.0),
+    particle(1.4, 1100.0, -5.0, [-0.4, 0.2], [0.0, -0.01], 0.9, 4.0),
 )
 
 
-def forces(name, r, i, j):
+def forces(r, i, j):
     """Return the force on i, mass times acceleration."""
     pair = make_pair(r)
     gradient = -pair.pull * pair.r
@@ -90,13 +76,9 @@ def forces(name, r, i, j):
     return terms, i["m"]
 
 
-NAMES = tuple(forces("", [0.1, 0.05], *({k: jnp.asarray(v) for k, v in side.items()} for side in VALUES))[0])
-
-
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", forces([0.1, 0.05], *VALUES)[0])
 def test_forces_of_a_pair_are_opposite_where_a_form_keeps_momentum(name):
-    i, j = ({key: jnp.asarray(value) for key, value in side.items()} for side in VALUES)
-    (there, mass_i), (back, mass_j) = forces(name, [0.06, 0.05], i, j), forces(name, [-0.06, -0.05], j, i)
+    (there, mass_i), (back, mass_j) = forces([0.06, 0.05], *VALUES), forces([-0.06, -0.05], *VALUES[::-1])
     there, back = mass_i * there[name](), mass_j * back[name]()
     assert np.abs(there).max() > 0
     keeps = name not in ("pressure difference", "less the mean pressure")  # as their docstrings say
@@ -105,20 +87,18 @@ def test_forces_of_a_pair_are_opposite_where_a_form_keeps_momentum(name):
 
 def test_viscosity_is_that_of_morris():
     """Eq. 22 of Morris, Fox & Zhu (1997), with dynamic viscosities of both particles, by NumPy."""
-    i, j = ({key: np.asarray(value) for key, value in side.items()} for side in VALUES)
-    r, h, nu = np.array([0.1, 0.05]), 1e-6, 0.01
+    (i, j), r, h, nu = VALUES, np.array([0.1, 0.05]), 1e-6, 0.01
     slopes = [float(KERNELS["quintic"].value(jnp.asarray(np.linalg.norm(r) + side * h), 0.1, 2)) for side in (1, -1)]
     gradient = -r / np.linalg.norm(r) * (slopes[0] - slopes[1]) / (2 * h)  # at i, of W(x_i - x_j)
     mu = nu * i["rho"] + nu * j["rho"]
     expected = j["m"] * mu * (-r @ gradient) / (i["rho"] * j["rho"] * (r @ r)) * (i["v"] - j["v"])
-    sides = ({key: jnp.asarray(value) for key, value in side.items()} for side in VALUES)
-    np.testing.assert_allclose(viscosity.morris(make_pair(r), *sides, nu), expected, rtol=1e-7)
+    np.testing.assert_allclose(viscosity.morris(make_pair(r), i, j, nu), expected, rtol=1e-7)
 
 
 def test_pressures_are_those_of_edac_with_a_transport_velocity():
     """Ramachandran & Puri (2019) by NumPy: volumes 1/ΣW, and pressures less the mean over the particles that the kernel reaches."""
-    scene = fluids.fluid("taylor-green", nx=8, jitter=0.3, transport=100.0)
-    scene = replace(scene, physics=replace(scene.physics, viscosity=None), velocities=np.zeros((64, 2)))
+    scene = replace(fluids.fluid("taylor-green", nx=8, jitter=0.3, transport=100.0), velocities=np.zeros((64, 2)))
+    scene = changed(scene, viscosity=None)
     p = np.random.default_rng(1).normal(1000.0, 1.0, 64)
     model, s = make_model(scene, backend="brute"), make_state(scene)
     a = jax.jit(solver.begin)(model, s._replace(p=jnp.asarray(p))).a
@@ -167,7 +147,7 @@ def test_density_of_a_lattice(dim):
     np.testing.assert_allclose(rho[inner], 1.0, rtol=2e-3)
 
 
-@pytest.mark.parametrize(("dim", "n", "h", "share"), [(2, 16, 2.0, 0.05), pytest.param(3, 8, 1.5, 0.12, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(("dim", "n", "h", "share"), [(2, 16, 2.0, 0.05), slow(3, 8, 1.5, 0.12)])
 def test_continuum_tension_presses_as_laplace_says(dim, n, h, share):
     """Σ m a·x = -∫ d p dV, p = (d-1) σ/R, of a ball whose particles are not in order."""
     spacing, kernel = 1 / n, KERNELS["wendland2"]

@@ -5,6 +5,7 @@ from dataclasses import replace
 import jax
 import numpy as np
 import pytest
+from poured import changed, scene_of
 
 from jfrnn.cases import fluids
 from jfrnn.sph import solver
@@ -12,16 +13,7 @@ from jfrnn.sph.model import make_model, make_state
 
 N = 64
 SITES = np.stack(np.meshgrid(np.arange(8.0), np.arange(8.0)), axis=-1).reshape(-1, 2) / 8
-BARE = fluids.FluidScene(
-    name="bare",
-    positions=SITES,
-    velocities=np.zeros((N, 2)),
-    masses=np.full(N, 1 / N),
-    spacing=1 / 8,
-    duration=1.0,
-    step=1e-3,
-    physics=fluids.Physics(density=1.0, sound_speed=10.0, smoothing=1 / 8, state="linear"),
-)
+BARE = scene_of(SITES, 1 / 8, fluids.Physics(density=1.0, sound_speed=10.0, smoothing=1 / 8, state="linear"), step=1e-3)
 PARTS = {
     "viscosity": {"viscosity": 0.1},
     "artificial viscosity": {"artificial": 0.1},
@@ -39,13 +31,13 @@ CORNERS = np.array([[-9.0, -9.0], [9.0, -9.0], [9.0, 9.0], [-9.0, 9.0]])
 FRAME = fluids.Solid(CORNERS, np.array([[1, 0], [2, 1], [3, 2], [0, 3]], np.int32))
 WHOLE = {
     "walls": replace(BARE, wall=np.arange(N) < 8),
-    "tank": replace(BARE, tank=fluids.Tank((0.0, 0.0), (1.0, 1.0)), physics=replace(BARE.physics, restitution=0.5)),
+    "tank": changed(replace(BARE, tank=fluids.Tank((0.0, 0.0), (1.0, 1.0))), restitution=0.5),
     "periodicity": replace(BARE, periodic=fluids.Periodic((0.0, 0.0), (1.0, 1.0), (True, True))),
     "inflow": replace(BARE, enters=np.linspace(0, 1, N)),
     "a Courant step": replace(BARE, step=None),
     "a solid": replace(BARE, solid=FRAME),
     "a solid that turns": replace(BARE, solid=replace(FRAME, turning=fluids.Turning((0.5, 0.5), None, 1.0))),
-    **{name: replace(BARE, physics=replace(BARE.physics, **change)) for name, change in PARTS.items()},
+    **{name: changed(BARE, **change) for name, change in PARTS.items()},
 }
 
 
@@ -108,7 +100,7 @@ def test_two_dimensions_compute_two_components(bare):
 
 def test_products_of_matrices_take_all_bits():
     """What a GPU makes of them by itself has 10 bits less."""
-    physics = replace(BARE.physics, gravity=(0.0, -1.0), viscosity=0.1, corrected=True)
-    text = traced(replace(BARE, wall=np.arange(N) < 8, physics=physics))[0].lower().as_text()
+    scene = changed(WHOLE["walls"], gravity=(0.0, -1.0), viscosity=0.1, corrected=True)
+    text = traced(scene)[0].lower().as_text()
     precisions = {line.split("precision = ")[1].split("]")[0] for line in text.splitlines() if "stablehlo.dot" in line}
     assert precisions == {"[HIGHEST, HIGHEST"}

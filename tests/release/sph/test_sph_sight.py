@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
+from poured import scene_of
 
 import jfrnn
 from jfrnn import sph
@@ -27,18 +28,9 @@ def between_blocks(thickness, thin, far=False, n=6):
     left = sph.lattice((-thickness / 2 - n * DX, -n * DX / 2, -n * DX / 2), (n, n, n), DX)
     x = np.concatenate([left, left * [-1, 1, 1] + [far, 0, 0]])
     sides = np.where(np.arange(len(x)) < len(left), 1.0, -1.0)
-    return sph.FluidScene(
-        name="blocks",
-        positions=x,
-        velocities=np.stack([0.1 * sides, 0 * sides, 0 * sides], axis=1),
-        masses=np.full(len(x), 1000.0 * DX**3),
-        densities=1002.0 + sides + np.cos(50 * x[:, 2]),
-        spacing=DX,
-        duration=0.1,
-        step=None,
-        physics=sph.Physics(density=1000.0, sound_speed=20.0, smoothing=1.5 * DX, pressure="mean", viscosity=1e-3, artificial=0.05),
-        solid=sph.Solid(*sheet(thickness), thin=thin),
-    )
+    physics = sph.Physics(1000.0, 20.0, smoothing=1.5 * DX, pressure="mean", viscosity=1e-3, artificial=0.05)
+    given = {"velocities": np.stack([0.1 * sides, 0 * sides, 0 * sides], axis=1), "solid": sph.Solid(*sheet(thickness), thin=thin)}
+    return scene_of(x, DX, physics, densities=1002.0 + sides + np.cos(50 * x[:, 2]), **given)
 
 
 def test_water_does_not_feel_water_through_a_sheet():

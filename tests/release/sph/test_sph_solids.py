@@ -6,8 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from checked import refuses
+from checked import refuses, slow
 from matplotlib.path import Path as Outline
+from poured import changed, scene_of
 from test_sph_commands import invoke, read_table
 
 from experiments.sph import answers, scenes
@@ -40,18 +41,9 @@ def is_inside(x, scene, time):
 
 def beside(solid, positions, spacing=0.1, velocities=None, **physics):
     """Return a scene of particles around a solid."""
-    physics = {"density": 1.0, "sound_speed": 10.0, "smoothing": 1.5 * spacing, "pressure": "mean"} | physics
-    return fluids.FluidScene(
-        name="beside",
-        positions=positions,
-        velocities=np.zeros_like(positions) if velocities is None else velocities,
-        masses=np.full(len(positions), spacing ** positions.shape[1]),
-        spacing=spacing,
-        duration=1.0,
-        step=0.25 * physics["smoothing"] / (1.2 * physics["sound_speed"]),
-        physics=fluids.Physics(**physics),
-        solid=solid,
-    )
+    made = fluids.Physics(**{"density": 1.0, "sound_speed": 10.0, "smoothing": 1.5 * spacing, "pressure": "mean"} | physics)
+    given = {} if velocities is None else {"velocities": velocities}
+    return scene_of(positions, spacing, made, step=0.25 * made.smoothing / (1.2 * made.sound_speed), solid=solid, **given)
 
 
 @pytest.mark.parametrize("name", ["wendland2", "wendland6", "cubic", "quintic"])
@@ -119,7 +111,7 @@ def test_a_wall_drags_by_the_dynamic_viscosity_of_the_source():
 SHARP = meshes.gear(6, 200, 1.0, 2.0, 3.0)
 
 
-@pytest.mark.parametrize("turning", [fluids.Turning((0.0,) * 3, (0.0, 0.0, 1.0), 2.0), pytest.param(None, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("turning", [fluids.Turning((0.0,) * 3, (0.0, 0.0, 1.0), 2.0), slow(None)])
 def test_nothing_passes_however_it_is_thrown(turning):
     """Particles thrown about at random around a gear with few, sharp teeth, many of them farther than its walls are thick."""
     random = np.random.default_rng(1)
@@ -218,7 +210,7 @@ def test_a_column_at_rest_on_a_wall():
     sides = np.stack([np.arange(8), (np.arange(8) + 1) % 8], axis=1)[:, ::-1].astype(np.int32)
     water = np.stack(np.meshgrid(np.arange(10) + 0.5, np.arange(10) + 0.5), axis=-1).reshape(-1, 2) * spacing
     scene = beside(fluids.Solid(tank, sides), water, spacing, gravity=(0.0, -1.0), sound_speed=15.0, density_diffusion=0.1)
-    scene = replace(scene, densities=1 + (1 - water[:, 1]) / 15.0**2, physics=replace(scene.physics, damping=10.0, state="linear"))
+    scene = changed(replace(scene, densities=1 + (1 - water[:, 1]) / 15.0**2), damping=10.0, state="linear")
     model, s = make_model(scene), make_state(scene)
     s, _ = solver.advance(model, solver.begin(model, s), None, 600)
     assert np.asarray(s.x).mean(axis=0) == pytest.approx([0.5, 0.5], abs=0.03)
@@ -259,8 +251,7 @@ def test_gradients_through_contact():
     ],
 )
 def test_what_does_not_go_with_a_solid_is_refused(change, match):
-    scene = drop_on_gear(2)
-    refuses(ValueError, match, make_model, replace(scene, physics=replace(scene.physics, **change)))
+    refuses(ValueError, match, make_model, changed(drop_on_gear(2), **change))
 
 
 def test_fluid_in_the_solid_and_open_meshes_are_refused():

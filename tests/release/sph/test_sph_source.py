@@ -3,6 +3,7 @@
 import jax
 import numpy as np
 import pytest
+from checked import slow
 from places import ROOT
 
 from jfrnn.cases import fluids
@@ -18,10 +19,7 @@ def make(name, backend="brute"):
     return model, solver.begin(model, make_state(scene))
 
 
-SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("one", "two", "three")]
-
-
-@pytest.mark.parametrize("name", [*SLOW, "four"])
+@pytest.mark.parametrize("name", [slow("one"), slow("two"), slow("three"), "four"])
 def test_energies_over_20_000_steps(name):
     model, s = make(name)
     energies = jax.jit(lambda s: (s.time, budget.kinetic_energy(model, s), budget.potential_energy(model, s)))

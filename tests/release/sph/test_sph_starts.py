@@ -1,10 +1,9 @@
 """What a start costs a flow, and released solvers that are not there."""
 
-from dataclasses import replace
-
 import numpy as np
 import pandas as pd
 import pytest
+from poured import changed
 
 from experiments.sph import peers
 from jfrnn import sph
@@ -24,7 +23,7 @@ def test_vortices_keep_more_energy_from_relaxed_particles():
     """By jax-sph's settings: densities are summed, the equation of state is linear, steps are those of leapfrog."""
     scene = fluids.fluid("taylor-green", nx=16, transport=100.0, jitter=0.0)
     theirs = {"evolve": "summation", "state": "linear", "integrator": "leapfrog", "pressure_diffusion": None}
-    scene = replace(scene, physics=replace(scene.physics, **theirs))
+    scene = changed(scene, **theirs)
     lattice, relaxed = map(kept, (scene, sph.relax(scene)))
     assert lattice < 0.8 * relaxed < 0.8
 
