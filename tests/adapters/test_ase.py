@@ -3,10 +3,7 @@
 import collections
 import importlib
 import itertools
-import subprocess
-import sys
 import tomllib
-from pathlib import Path
 from types import SimpleNamespace
 
 import checked
@@ -14,6 +11,8 @@ import numpy as np
 import pytest
 import reference
 from checked import refuses, slow
+from places import ROOT
+from started import run_python
 
 import jfrnn.ase
 import jfrnn.matscipy
@@ -21,7 +20,6 @@ import jfrnn.vesin
 from jfrnn.ase import neighbor_list, primitive_neighbor_list
 from jfrnn.cases.periodic import PERIODIC_CASES
 
-ROOT = Path(__file__).parents[2]
 pytestmark = pytest.mark.filterwarnings("ignore:Setting the shape on a NumPy array:DeprecationWarning:ase")  # in ASE 3.29 itself
 
 
@@ -213,7 +211,7 @@ assert not jax._src.xla_bridge.backends_are_initialized()
 def test_it_takes_no_device_of_jax_and_its_plugin_no_module():
     """ASE imports the plugin whenever it collects plugins; of its released versions, 3.29 has no `NeighborListPlugin` yet."""
     entries = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["entry-points"]["ase.plugins"]
-    subprocess.run([sys.executable, "-c", PLUGIN % entries["jfrnn"]], check=True, cwd=ROOT)
+    run_python("-c", PLUGIN % entries["jfrnn"])
 
 
 @pytest.mark.parametrize("bothways", [True, False])

@@ -2,14 +2,13 @@
 
 import collections
 import csv
-import subprocess
-import sys
 
 import jax
 import numpy as np
 import pytest
 import reference
 from places import ROOT
+from started import run_python
 
 import jfrnn
 from jfrnn._engine import auto as _auto
@@ -45,9 +44,7 @@ sys.meta_path.insert(0, Blocker())
 import jax, jfrnn
 X = np.random.default_rng(0).random((50, 3)).astype(np.float32)
 """
-    done = subprocess.run([sys.executable, "-c", blocker + code], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    return done.stdout
+    return run_python("-c", blocker + code).stdout
 
 
 @pytest.fixture(scope="module")

@@ -6,11 +6,11 @@ import functools
 import importlib
 import inspect
 import re
-import subprocess
 import sys
 
 import pytest
 from places import ROOT
+from started import run_python
 
 import jfrnn
 
@@ -233,9 +233,7 @@ print(sorted(offered), hasattr(jfrnn, "serach"))
 
 def test_import_starts_nothing():
     """It offers modules, which are imported when they are asked for."""
-    run = subprocess.run([sys.executable, "-c", IMPORT], capture_output=True, text=True, check=False)
-    assert run.returncode == 0, run.stderr
-    imported, offered = run.stdout.splitlines()
+    imported, offered = run_python("-c", IMPORT).stdout.splitlines()
     assert set(ast.literal_eval(imported)) <= {"jfrnn", *sys.stdlib_module_names}
     assert offered == "['ase', 'distributed', 'jax_md', 'matscipy', 'sph', 'vesin'] False"
 

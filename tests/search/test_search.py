@@ -1,7 +1,5 @@
 """`search` and `count`: options, capacity, jit, batches, and every input error."""
 
-import subprocess
-import sys
 from itertools import product
 
 import checked
@@ -12,6 +10,7 @@ import pytest
 import reference
 import soon
 from checked import refuses, slow, sparing
+from started import run_python
 
 import jfrnn
 
@@ -323,7 +322,7 @@ def test_a_program_may_end_before_its_results():
         "both = [search(backend).lower(x).compile() for backend in ('warp', 'hashgrid')]\n"
         "found = [each(x) for each in both]\n"  # what is compiled returns at once, and the interpreter exits
     )
-    subprocess.run([sys.executable, "-c", program], check=True, timeout=300, capture_output=True)
+    run_python("-c", program, timeout=300)
 
 
 def test_atoms_are_told_where_their_positions_are():

@@ -7,9 +7,6 @@ many ulp (sinh by hundreds), NumPy's `longdouble` decides.
 
 import functools
 import itertools
-import os
-import subprocess
-import sys
 
 import jax
 import numpy as np
@@ -17,6 +14,7 @@ import pytest
 from checked import refuses, slow, sparing
 from jax import lax
 from jax import numpy as jnp
+from started import run_python
 from translated import Case, kernel_of, run
 from translated_cases import CASES, ELEMENTWISE, INTEGERS, PAIRS, N
 
@@ -215,10 +213,9 @@ print(translate(jax.make_jaxpr(lambda x: x * jax.numpy.sin(x) + 2)(1.0)).key)
 
 
 def test_key_is_the_same_in_every_process():
-    env = {**os.environ, "PYTHONHASHSEED": "1"}  # another one than that of this process
-    run = subprocess.run([sys.executable, "-c", KEY], capture_output=True, text=True, check=True, env=env)
-    assert run.stdout == translated(lambda x: 2 + x * jnp.sin(x), np.float32(1)).key + "\n"
-    assert translated(lambda x: 3 + x * jnp.sin(x), np.float32(1)).key not in run.stdout
+    said = run_python("-c", KEY, PYTHONHASHSEED="1").stdout  # another one than that of this process
+    assert said == translated(lambda x: 2 + x * jnp.sin(x), np.float32(1)).key + "\n"
+    assert translated(lambda x: 3 + x * jnp.sin(x), np.float32(1)).key not in said
 
 
 # --- CUDA -------------------------------------------------------------------------------------------------------------

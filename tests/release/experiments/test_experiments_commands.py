@@ -1,19 +1,16 @@
 """The command line: its list, its help texts, and what it says of values that are out of range."""
 
-import subprocess
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 import typer
 from commanded import invoke, refused, told
+from places import ROOT
+from started import run_python
 
 from experiments import _commands, _config
 from experiments._errors import UsageError
 from experiments.bench.gpu import Config
 
-ROOT = Path(_commands.__file__).resolve().parent.parent
 CONFIGS = ROOT / "experiments" / "configs"
 TOP = ("run", "init", "report", "tables", "merge", "list", "show", "export", "bench", "sph", "gpu")
 BENCH = (
@@ -195,8 +192,7 @@ def test_too_little_memory_is_said_in_a_line(capsys):
 
 
 def test_a_mistake_ends_a_process_with_2_and_a_line():
-    command = [sys.executable, "-m", "experiments", "show", "corners", "--dim", "4"]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
-    assert (done.returncode, done.stdout) == (2, "")
+    done = run_python("-m", "experiments", "show", "corners", "--dim", 4, ends=2)
+    assert done.stdout == ""
     assert done.stderr.startswith("error: --dim 4: ")
     assert done.stderr.endswith("(see python -m experiments show --help)\n")

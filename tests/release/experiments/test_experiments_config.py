@@ -1,10 +1,9 @@
-import subprocess
-import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from places import ROOT
+from started import run_python
 
 from experiments import _config, _layouts, _rows, _sweep, _thesis, _worker, methods
 from experiments._errors import UsageError
@@ -186,5 +185,4 @@ def test_what_needs_nothing_heavy_imports_nothing_heavy(tmp_path):
     code = f"import sys; from experiments import _cli; print(sorted({heavy} & set(sys.modules)))\n"
     code += f"from experiments import _worker; print(_worker._answer({task})['status'])\n"
     code += "print(sorted({'jax', 'jfrnn', 'pandas', 'matplotlib'} & set(sys.modules)))"
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True, timeout=60)
-    assert done.stdout.splitlines() == ["[]", "ok", "[]"]
+    assert run_python("-c", code, timeout=60).stdout.splitlines() == ["[]", "ok", "[]"]

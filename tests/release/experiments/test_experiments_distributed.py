@@ -1,12 +1,10 @@
 """`python -m experiments bench distributed`: rows, what is sent, the table; in a process of its own, which asks for its devices."""
 
 import json
-import os
-import subprocess
-import sys
 
 import pytest
 from places import ROOT
+from started import run_python
 
 from experiments._config import load
 from experiments.bench import distributed
@@ -27,10 +25,8 @@ backend = "warp"
 
 def run(tmp_path, text):
     (tmp_path / "tiny.toml").write_text(text)
-    words = ["bench", "distributed", str(tmp_path / "tiny.toml"), "--out", str(tmp_path / "out")]
-    command = [sys.executable, "-m", "experiments", *words]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT, env=os.environ | {"JAX_PLATFORMS": "cpu"})
-    assert done.returncode == 0, done.stderr
+    words = ("bench", "distributed", tmp_path / "tiny.toml", "--out", tmp_path / "out")
+    done = run_python("-m", "experiments", *words, JAX_PLATFORMS="cpu")
     rows = [json.loads(line) for line in (tmp_path / "out" / "rows.jsonl").read_text().splitlines()]
     return done.stdout, rows
 

@@ -14,7 +14,7 @@ import numpy as np
 import psutil
 import pytest
 from checked import refuses
-from commanded import invoke
+from commanded import invoke, told
 from places import ROOT
 
 from experiments import _config, _machine, _measure, _rows, _sweep, _worker
@@ -247,16 +247,14 @@ def test_two_shards_merged_are_the_whole(tmp_path):
     shards = [parts.out / f"shard-{k}-of-2" for k in (1, 2)]
     scenes = [{(row.layout, row.fill_asked) for row in _rows.RowFile(shard).read()} for shard in shards]
     assert [len(part) for part in scenes] == [2, 1]  # a scene is measured on one machine
-    done = subprocess.run([*parts.command[:3], "merge", str(parts.out)], cwd=ROOT, capture_output=True, text=True, check=True)
-    assert done.stdout.startswith("6 rows came")
+    assert told("merge", parts.out).startswith("6 rows came")
 
-    def told(rows):
+    def said(rows):
         names = ("key", "layout", "fill_asked", "method", "process", "status", "pairs", "missing", "extra")
         return sorted([tuple(str(row[name]) for name in names) for row in rows])
 
-    assert told(parts.rows()) == told(whole.rows())
-    again = subprocess.run([*parts.command[:3], "merge", str(parts.out)], cwd=ROOT, capture_output=True, text=True, check=True)
-    assert again.stdout.startswith("0 rows came")
+    assert said(parts.rows()) == said(whole.rows())
+    assert told("merge", parts.out).startswith("0 rows came")
     assert len(parts.rows()) == 6
     assert "6 of 6 rows are there already" in parts.run().stderr  # the whole sweep goes on from them
 

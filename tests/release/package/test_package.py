@@ -15,6 +15,7 @@ from pathlib import Path
 import pytest
 from checked import refuses
 from places import ROOT, list_files
+from started import run_python
 
 import jfrnn
 from jfrnn import __main__
@@ -33,10 +34,7 @@ FLUID = ("-m", "jfrnn.sph", "run", "one", "--set", "duration=0.0002", "--frames"
 
 
 def run(*arguments, cwd, python=sys.executable, **environment):
-    told = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"} | environment
-    done = subprocess.run([python, *arguments], cwd=cwd, capture_output=True, text=True, check=False, env=told)
-    assert done.returncode == 0, done.stdout + done.stderr
-    return done.stdout
+    return run_python(*arguments, cwd=cwd, python=python, without=("PYTHONPATH",), **environment).stdout
 
 
 def build_wheel(folder):

@@ -1,11 +1,9 @@
 """What is told while tests run: which file begins, how long it took, and where a test hangs."""
 
-import os
 import re
-import subprocess
-import sys
 
 from places import TESTS
+from started import run_python
 
 SCENE = {
     "conftest.py": "import progress\n\nprogress.PATIENCE = 1\npytest_plugins = ['progress']\n",
@@ -17,9 +15,8 @@ SCENE = {
 def test_files_are_told_as_they_begin_and_end_and_what_hangs(tmp_path):
     for name, text in SCENE.items():
         (tmp_path / name).write_text(text)
-    given = {**os.environ, "PYTHONPATH": str(TESTS)}
-    command = [sys.executable, "-m", "pytest", "-n", "2", "--dist", "loadfile", "-p", "no:cacheprovider", str(tmp_path)]
-    told = subprocess.run(command, cwd=tmp_path, env=given, capture_output=True, text=True).stdout
+    words = ("-m", "pytest", "-n", 2, "--dist", "loadfile", "-p", "no:cacheprovider", tmp_path)
+    told = run_python(*words, ends=1, cwd=tmp_path, PYTHONPATH=str(TESTS)).stdout
     for line in (
         r" test_quick\.py: 3 tests begin$",
         r"\[ 75%\] test_quick\.py: 1 failed, 1 passed, 1 skipped in \d+\.\d s$",

@@ -2,14 +2,13 @@
 
 import os
 import re
-import subprocess
-import sys
 
 import pasted
 import pytest
 import soon
 from checked import refuses
 from places import ROOT
+from started import run_python
 
 import jfrnn
 from experiments import pages
@@ -41,13 +40,6 @@ GROUPS = {
 }
 
 
-def run(*arguments, **environment):
-    told = os.environ | {"PYTHONPATH": str(ROOT)} | environment
-    done = subprocess.run([sys.executable, *arguments], cwd=ROOT, capture_output=True, text=True, check=False, env=told)
-    assert done.returncode == 0, done.stdout + done.stderr
-    return done.stdout
-
-
 @pytest.fixture(scope="module")
 def ran():
     """Run the blocks of all pages in one process, those of a page in order and in a namespace of its own.
@@ -55,10 +47,8 @@ def ran():
     As a user finds the library: no 64-bit mode, here four virtual devices. Returns lines of code by page, and errors.
     """
     flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=4"
-    told = os.environ | {"PYTHONPATH": str(ROOT), "XLA_FLAGS": flags}
     given = [page for pages in GROUPS.values() for page in pages]
-    command = [sys.executable, "-W", "error::RuntimeWarning", "-c", pasted.PROGRAM, *given]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False, env=told)
+    done = run_python("-W", "error::RuntimeWarning", "-c", pasted.PROGRAM, *given, PYTHONPATH=str(ROOT), XLA_FLAGS=flags)
     return pasted.lines_run(done.stdout), done.stderr
 
 
@@ -71,7 +61,8 @@ def test_code_of_pages(group, ran):
 
 def test_pages_build(tmp_path):
     """With warnings as errors: links, anchors and cross-references are there, docstrings can be read, no page is left out."""
-    run("-c", BUILD, "-W", "--keep-going", "--quiet", "--builder", "html", str(ROOT / "docs"), str(tmp_path))
+    options = ("-W", "--keep-going", "--quiet", "--builder", "html")
+    run_python("-c", BUILD, *options, ROOT / "docs", tmp_path, PYTHONPATH=str(ROOT))
     html = {path.stem: path.read_text(encoding="utf-8") for path in (tmp_path / "api" / "objects").glob("*.html")}
     public = [f"{module.__name__}.{name}" for module in (jfrnn, distributed, sph) for name in module.__all__]
     missing = [name for name in public if f'id="{name}"' not in html.get(name, "")]

@@ -2,13 +2,12 @@
 
 import json
 import re
-import subprocess
-import sys
 from functools import cache
 
 import pytest
 import soon
 from places import ROOT
+from started import run_python
 
 NOTEBOOKS = ROOT / "notebooks"
 RUN = (
@@ -82,9 +81,7 @@ def run(names):
 
     Most of the time of a notebook is the start of a process, and what several of them measure or compile.
     """
-    command = [sys.executable, "-c", RUN, *(str(NOTEBOOKS / f"{name}.ipynb") for name in names)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=NOTEBOOKS)
-    assert done.returncode == 0, done.stderr
+    done = run_python("-c", RUN, *(NOTEBOOKS / f"{name}.ipynb" for name in names), cwd=NOTEBOOKS)
     return {name: found for name, *found in (json.loads(line[1:]) for line in done.stdout.splitlines() if line[:1] == "\0")}
 
 

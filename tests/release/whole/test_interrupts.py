@@ -2,8 +2,6 @@
 
 import os
 import signal
-import subprocess
-import sys
 import threading
 import time
 
@@ -12,20 +10,15 @@ import numpy as np
 import pytest
 from checked import slow
 from places import TESTS
+from started import run_python
 
 import jfrnn
 from jfrnn._engine import launch
 
-PROGRAM = TESTS / "interrupted.py"
-
 
 def run(tries, *more):
     """Raise so many times in each of 16 works; return how often a result was wrong, and an exception lost."""
-    environment = os.environ | {"JAX_ENABLE_X64": "0"}
-    done = subprocess.run(
-        [sys.executable, PROGRAM, str(tries), *more], capture_output=True, text=True, check=False, env=environment
-    )
-    assert done.returncode == 0, done.stderr
+    done = run_python(TESTS / "interrupted.py", tries, *more, JAX_ENABLE_X64="0")
     print(done.stderr)  # what was dropped, and where
     words = done.stdout.split()
     return {kind: int(times) for kind, times in zip(words[::2], words[1::2])}

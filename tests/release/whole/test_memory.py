@@ -3,8 +3,6 @@
 import dataclasses
 import itertools
 import os
-import subprocess
-import sys
 import time
 
 import jax
@@ -13,6 +11,7 @@ import pytest
 import warp as wp
 from checked import refuses, slow, slowly
 from places import ROOT, TESTS
+from started import run_python
 
 import jfrnn
 import jfrnn._memory
@@ -161,9 +160,7 @@ def test_two_blobs_cost_the_same_however_far_apart(backend):
     """
     n, taken = 200_000, []
     for separation in ("10", "1e6"):
-        command = [sys.executable, "-c", BLOBS, backend, str(n), separation]
-        done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
-        source, size, cutoff, required = done.stdout.split()
+        source, size, cutoff, required = run_python("-c", BLOBS, backend, n, separation).stdout.split()
         if source != "VmHWM":
             pytest.skip("this system cannot reset the peak of a process")
         assert int(required) > 50
@@ -238,12 +235,8 @@ print(memory.source, memory.peak() - memory.start)
 @pytest.mark.parametrize("gradient", [False, True])
 def test_sums_take_what_was_planned(gradient):
     """In a process of its own, as a search above."""
-    n, tests = 300_000, [str(TESTS), str(TESTS / "release" / "whole")]
-    command = [sys.executable, "-c", SUMS, str(n), str(gradient)]
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), *tests])}
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False, env=environment)
-    assert done.returncode == 0, done.stderr
-    source, size = done.stdout.split()[-2:]
+    n, path = 300_000, os.pathsep.join(map(str, (ROOT, TESTS, TESTS / "release" / "whole")))
+    source, size = run_python("-c", SUMS, n, gradient, PYTHONPATH=path).stdout.split()[-2:]
     if source != "VmHWM":
         pytest.skip("this system cannot reset the peak of a process")
     plan = jfrnn.memory_plan(n, 0.03, fn=density, values=numbers_of(n, np.float32, "m"), gradient=gradient)

@@ -2,7 +2,6 @@
 
 import gc
 import itertools
-import subprocess
 import sys
 
 import jax
@@ -11,6 +10,7 @@ import numpy as np
 import pytest
 import reference
 from checked import slots_as_set, slow
+from started import run_python
 
 import jfrnn
 from jfrnn._tracing import on_device
@@ -157,8 +157,7 @@ print(len(compiled))
 
 def test_a_first_gradient_compiles_the_sum_and_its_derivative_alone():
     """Numbers that are known are made on the host: a program for each would take longer than these two."""
-    done = subprocess.run([sys.executable, "-c", FIRST_GRADIENT], capture_output=True, text=True, check=True, timeout=300)
-    assert done.stdout.split() == ["2"]
+    assert run_python("-c", FIRST_GRADIENT, timeout=300).stdout.split() == ["2"]
 
 
 def test_programs_of_few_particles_run_on_the_thread_that_calls_them():
@@ -268,8 +267,7 @@ print(most, resident() - first, before, between, maps())
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux counts memory maps")
 def test_memory_of_a_thousand_numbers_of_particles_is_bounded_and_given_back():
     """Below 200 MB; of memory maps, too."""
-    printed = subprocess.run([sys.executable, "-c", MANY_SIZES], capture_output=True, text=True, check=True).stdout
-    most, left, before, between, after = map(float, printed.split())
+    most, left, before, between, after = map(float, run_python("-c", MANY_SIZES).stdout.split())
     assert most < 200
     assert left < 0.75 * most
     assert between > before + 60

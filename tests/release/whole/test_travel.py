@@ -1,11 +1,8 @@
 """Programs that travel: exported or compiled here, they run in a process that has imported the library and traced nothing."""
 
 import dataclasses
-import os
 import pickle
 import re
-import subprocess
-import sys
 
 import jax
 import numpy as np
@@ -14,6 +11,7 @@ import travelled
 from jax.experimental import serialize_executable
 from jax.experimental.compilation_cache import compilation_cache
 from places import TESTS
+from started import run_python
 
 import jfrnn
 
@@ -22,10 +20,7 @@ SAFE = [jax.export.DisabledSafetyCheck.custom_call("jfrnn")]
 
 def run_elsewhere(way, folder, right):
     """Run the program of a folder in a fresh process, and compare what it gives; return what it writes."""
-    environment = os.environ | {"JAX_ENABLE_X64": "1", "JAX_NUMPY_DTYPE_PROMOTION": "strict"}
-    command = [sys.executable, TESTS / "travelled.py", way, folder]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
-    assert done.returncode == 0, done.stderr
+    done = run_python(TESTS / "travelled.py", way, folder, JAX_ENABLE_X64="1", JAX_NUMPY_DTYPE_PROMOTION="strict")
     with np.load(folder / "answers.npz") as found:
         for x, name in zip(right, found, strict=True):
             np.testing.assert_array_equal(found[name], x)
