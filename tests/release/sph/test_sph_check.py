@@ -27,15 +27,9 @@ def turning(center=(0.0, 0.0), rate=1.0):
     ("change", "message"),
     [
         ({"positions": POSITIONS.tolist()}, r"positions must be an array of shape \[n, d\], got list .*: take numpy.asarray"),
-        (
-            {"positions": POSITIONS[:, :1]},
-            r"positions must be an array of shape \[n, 2\] or \[n, 3\], got an array of shape",
-        ),
+        ({"positions": POSITIONS[:, :1]}, r"positions must be an array of shape \[n, 2\] or \[n, 3\], got an array of shape"),
         ({"positions": POSITIONS * np.nan}, "positions are not finite: particle 0 is not"),
-        (
-            {"velocities": np.zeros((4, 2))},
-            r"velocities must be an array of shape \[5, 2\], as positions say.* got an array",
-        ),
+        ({"velocities": np.zeros((4, 2))}, r"velocities must be an array of shape \[5, 2\], as positions say.* got an array"),
         ({"masses": 1.0}, r"masses must be an array of shape \[5\], as positions say, got float 1.0"),
         ({"masses": np.arange(5.0)}, "masses must be above 0: particle 0 has 0.0"),
         ({"wall": np.zeros(5)}, r"wall must be an array of shape \[5\], bool, or None, got an array of shape \[5\], float64"),
@@ -55,10 +49,7 @@ def turning(center=(0.0, 0.0), rate=1.0):
         ({"sealed": fluids.Tank((1.0, 0.0), (0.0, 1.0))}, "sealed must reach from a lower to an upper corner"),
         ({"periodic": fluids.Periodic((0.0, 0.0), (1.0, 1.0), (True,))}, "periodic.axes must say of each of 2 axes"),
         ({"periodic": fluids.Periodic((0.0, 0.0), (1.0, 1.0, 1.0), (True, True))}, "periodic.lengths must have a number for each"),
-        (
-            {"periodic": fluids.Periodic(0.0, (1.0, 1.0), (True, True))},
-            "periodic.lower must have a number for each",
-        ),
+        ({"periodic": fluids.Periodic(0.0, (1.0, 1.0), (True, True))}, "periodic.lower must have a number for each"),
         ({"periodic": fluids.Periodic((0.0, 0.0), (1.0, 0.0), (True, True))}, "periodic must have .* finite lengths above 0"),
         ({"periodic": fluids.Periodic((0.0, 0.0), (1.0, 1.0), True)}, "periodic.axes must say of each of 2 axes"),
         ({"bounds": fluids.Tank((-np.inf, 0.0), (1.0, 1.0))}, "bounds must be finite, for they are what pictures show"),
@@ -72,10 +63,7 @@ def turning(center=(0.0, 0.0), rate=1.0):
         ({"physics": replace(PHYSICS, gravity=(0.0, 0.0, -9.81))}, "gravity has 3 components, expected 2 in 2D"),
         ({"physics": replace(PHYSICS, kernel="gauss")}, r"physics.kernel: got 'gauss'; input should be 'cubic', "),
         ({"physics": replace(PHYSICS, density=-1.0)}, r"physics.density: got -1.0; input should be greater than 0 \(above 0\)"),
-        (
-            {"physics": replace(PHYSICS, viscosity=np.float64(np.nan))},
-            "physics.viscosity: got nan; input should be a finite",
-        ),
+        ({"physics": replace(PHYSICS, viscosity=np.float64(np.nan))}, "physics.viscosity: got nan; input should be a finite"),
         ({"physics": replace(PHYSICS, smoothing=0.15e-3)}, "smoothing is 0.00015 m, expected 0.1 to 50 particle spacings of 0.1 m"),
         (
             {

@@ -297,10 +297,7 @@ upper = [0.4, 0.4, 0.3]
     ("more", "message"),
     [
         ('[[fill]]\nfile = "open.stl"', "fill: open.stl must be a closed mesh"),
-        (
-            '[[fill]]\nfile = "cube.stl"\nunit = 0.001',
-            "fill: in cube.stl there is no room for particles 0.1 m apart",
-        ),
+        ('[[fill]]\nfile = "cube.stl"\nunit = 0.001', "fill: in cube.stl there is no room for particles 0.1 m apart"),
         ('[solid]\nfile = "cube.stl"\nunit = 0.001', "solid .*cube.stl: is 0.0004 m long, .*; name the unit of the file"),
         ('[solid]\nfile = "cube.stl"\naxis = [0.0, 0.0, 1.0]', "solid: has a center or an axis, and no rate"),
         ('[solid]\nfile = "cube.stl"\nrate = 1.0', "solid.turning.axis must have a number for each of 3 axes, got NoneType None"),

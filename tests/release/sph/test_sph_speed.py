@@ -70,10 +70,7 @@ def rates(model, s):
     return forces.carried_rate(model, s, s.rho, None, None), a, seen.p, seen.rho
 
 
-@pytest.mark.parametrize(
-    ("name", "settings"),
-    [("jet", {"layers": 3, "duration": 5e-4}), ("dam-break-2d", {"nx": 4})],
-)
+@pytest.mark.parametrize(("name", "settings"), [("jet", {"layers": 3, "duration": 5e-4}), ("dam-break-2d", {"nx": 4})])
 @pytest.mark.slow
 def test_rows_that_nobody_reads_may_be_left_out(name, settings):
     scene = fluids.fluid(name, **settings)
