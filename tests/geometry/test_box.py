@@ -33,19 +33,23 @@ def image_pairs(nbrs, positions, queries=None):
     used = np.arange(nbrs.capacity) < count[:, None]
     assert (idx[~used] == nbrs.source_count).all()
     i, k = np.nonzero(used)
-    j, kind = idx[i, k], nbrs.box_kind
+    j, kind, dim = idx[i, k], nbrs.box_kind, nbrs.box.dim
+    system = np.asarray(nbrs.batch.sources if queries is None else nbrs.batch.queries)[i] if kind.per_system else np.zeros_like(i)
     if nbrs.images is None:
         x = np.asarray(positions, np.float64)
-        q, periodic = x if queries is None else np.asarray(queries, np.float64), list(kind.periodic)
+        q = x if queries is None else np.asarray(queries, np.float64)
         vectors = np.asarray(nbrs.box.vectors, np.float64)
-        vectors = (np.diag(vectors) if vectors.ndim == 1 else vectors)[periodic]
-        shifts = np.zeros((len(i), x.shape[1]), int)
-        shifts[:, periodic] = -np.rint((x[j] - q[i]) @ np.linalg.pinv(vectors))
+        vectors = vectors if kind.per_system else vectors[None]
+        vectors = vectors[..., None] * np.eye(dim) if vectors.ndim == 2 else vectors
+        periodic = np.array(kind.periodic) if nbrs.box.flags is None else np.asarray(nbrs.box.flags)
+        inverse = np.linalg.pinv(np.where(periodic[..., None], vectors, 0))
+        shifts = -np.rint(np.einsum("pd,pdk->pk", x[j] - q[i], inverse[system]))
     else:
-        turns, query_turns = (None if t is None else np.asarray(unpacked(t, nbrs.box.dim)) for t in nbrs.images[1:])
-        shifts = kind.shifts[np.asarray(nbrs.images.codes)[i, k]] + (turns if query_turns is None else query_turns)[i] - turns[j]
-        shifts = shifts @ kind.numbers  # of given vectors, where the list counts short ones
-    return checked.as_set(i, j, shifts)
+        turns, of_rows = (None if t is None else np.asarray(unpacked(t, dim)) for t in nbrs.images[1:])
+        shifts = kind.shifts[np.asarray(nbrs.images.codes)[i, k]] + (turns if of_rows is None else of_rows)[i] - turns[j]
+        numbers = np.asarray(nbrs.box.numbers)[system] if kind.short else kind.numbers
+        shifts = (shifts[:, None] @ numbers)[:, 0]  # of given vectors, where the list counts short ones
+    return checked.as_set(i, j, shifts.astype(int))
 
 
 @jax.jit

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import reference
 from by_numpy import in_order
-from checked import as_set, assert_same, padded, refuses, slow, sparing
-from test_box import energy_and_slopes, masked_images, unpacked
+from checked import assert_same, padded, refuses, slow, sparing
+from test_box import energy_and_slopes, image_pairs, masked_images
 
 import jfrnn
 from jfrnn.cases.crystals import CRYSTAL_CASES
@@ -49,27 +49,6 @@ def expected_images(name, dtype, dim, closed=False, half=False):
     return oracle(given.boxes, given.positions, given.batch, given.cutoff, given.periodic, **of_queries, **options)
 
 
-def listed_images(nbrs, x, **queries):
-    """Return (i, j, S) of all slots of a list without a skin; S is found without the library's vectors."""
-    assert not nbrs.overflow
-    idx, kind, batch = np.asarray(nbrs.idx), nbrs.box_kind, nbrs.batch
-    i, k = np.nonzero(np.arange(nbrs.capacity) < np.asarray(nbrs.count)[:, None])
-    assert (idx != nbrs.source_count).sum() == len(i)
-    j, system = idx[i, k], np.asarray(batch.queries if queries else batch.sources)[i]
-    if nbrs.images is None:
-        x = np.asarray(x, np.float64)
-        q = np.asarray(queries["queries"], np.float64) if queries else x
-        boxes = np.asarray(nbrs.box.vectors, np.float64)[system]
-        boxes = boxes[:, None] * np.eye(x.shape[1]) if boxes.ndim == 2 else boxes
-        shifts = -np.rint(np.einsum("pd,pdk->pk", x[j] - q[i], np.linalg.inv(boxes))).astype(int)
-    else:
-        turns, of_rows = (None if t is None else np.asarray(unpacked(t, x.shape[1])) for t in nbrs.images[1:])
-        shifts = kind.shifts[np.asarray(nbrs.images.codes)[i, k]] + (turns if of_rows is None else of_rows)[i] - turns[j]
-        if nbrs.box.numbers is not None:  # of given vectors, where the list counts short ones
-            shifts = np.einsum("ps,psd->pd", shifts, np.asarray(nbrs.box.numbers)[system]).astype(int)
-    return as_set(i, j, shifts)
-
-
 def box_of(given):
     return jfrnn.Box(given.boxes, given.periodic, per_system=True)
 
@@ -97,7 +76,7 @@ def assert_case(name, dtype, dim, backend, closed=False, half=False, geometry=Fa
     options = {"box": box, "batch": batch, "backend": backend, "closed": closed, "half": half}
     nbrs = jfrnn.search(jnp.asarray(x), given.cutoff, capacity=CAPACITY[dim], **queries, **options)
     nbrs.check()
-    assert_same(masked_images(nbrs, x, **queries) if geometry else listed_images(nbrs, x, **queries), expected)
+    assert_same(masked_images(nbrs, x, **queries) if geometry else image_pairs(nbrs, x, **queries), expected)
     assert int(np.asarray(nbrs.count).sum()) == len(expected) > 0
     assert nbrs.backend == backend
     assert (box_of(given).numbers is None) == (name != "unreduced")
@@ -228,7 +207,7 @@ def test_one_program_serves_other_boxes_and_flags():
             boxes = np.array(lengths)
             found = search(x, boxes, periodic, batch)
             found.check()
-            assert listed_images(found, x) == oracle(boxes, np.asarray(x), batch, 0.5, periodic)
+            assert image_pairs(found, x) == oracle(boxes, np.asarray(x), batch, 0.5, periodic)
     assert jfrnn.Status.BOX_TOO_SMALL in jfrnn.Status(int(search(x, np.full((4, 2), 0.1), PERIODIC, batch).status))
     empty = boxes * [[1.0], [1.0], [1.0], [0.0]]  # of a system without particles, whatever its box is
     search(np.where(batch[:, None] == 3, np.nan, x), empty, PERIODIC, np.where(batch == 3, -1, batch)).check()
@@ -242,7 +221,7 @@ def test_grow_in_boxes_that_shrink():
     assert nbrs.images is None
     boxes = np.array([[0.4, 0.9], [1.5, 0.7], [9.0, 9.0]])
     small = jfrnn.Box(boxes, per_system=True)
-    assert listed_images(nbrs.grow(x, box=small), x) == oracle(boxes, np.asarray(x), batch, 0.5)
+    assert image_pairs(nbrs.grow(x, box=small), x) == oracle(boxes, np.asarray(x), batch, 0.5)
 
 
 def test_numbers_without_a_box_are_told():
@@ -293,7 +272,7 @@ def test_near_ties_of_particles_a_hundred_cells_away():
     expected = oracle(boxes, x, batch, 0.5)
     nbrs = jfrnn.search(jnp.asarray(x), 0.5, box=jfrnn.Box(boxes, per_system=True), batch=batch, capacity=16, backend="warp")
     nbrs.check()
-    assert listed_images(nbrs, jnp.asarray(x)) == expected
+    assert image_pairs(nbrs, jnp.asarray(x)) == expected
     near = {pair[:2] for pair in expected}
     assert 10 < sum((k, k + 1) in near for k in range(0, 120, 2)) < 50
 

@@ -10,8 +10,8 @@ import pytest
 import reference
 from by_numpy import in_order
 from checked import slow, sparing
-from test_box import masked_images, pull_back
-from test_boxes import box_of, listed_images, system_by_system
+from test_box import image_pairs, masked_images, pull_back
+from test_boxes import box_of, system_by_system
 from test_search_edges import edges_as_set
 
 import jfrnn
@@ -90,7 +90,7 @@ def test_case(name, who, dtype, dim, backend):
     nbrs = given.search(backend, capacity=CAPACITY[dim])
     nbrs.check()
     expected = given.pairs()
-    assert listed_images(nbrs, given.x, **given.queries) == expected
+    assert image_pairs(nbrs, given.x, **given.queries) == expected
     assert masked_images(nbrs, given.x, **given.queries) == expected
     np.testing.assert_array_equal(given.search(backend, jfrnn.count), nbrs.count)
     assert len(expected) > 0 and nbrs.backend == backend
@@ -204,7 +204,7 @@ def test_what_is_wrong_sets_bits_and_absent_particles_may_have_any_cutoff(backen
     count = jax.jit(lambda radii: jfrnn.search(given.x, radii, capacity=96, box=box, batch=given.batch, **given.options))
     nbrs = count(radii)
     nbrs.check()
-    assert listed_images(nbrs, given.x) == given.pairs()
+    assert image_pairs(nbrs, given.x) == given.pairs()
     radii[np.flatnonzero(~gone)[0]] = np.nan
     assert jfrnn.Status(int(count(radii).status)) == jfrnn.Status.INVALID_CUTOFF
 
@@ -219,5 +219,5 @@ def test_far_reaching_queries_among_sources_with_small_cutoffs():
     nbrs = jfrnn.search(jnp.asarray(x), radii, radius_rule="either", capacity=32, backend="warp", **given)
     nbrs.check()
     expected = oracle("either", boxes, x, batch, radii, queries=q, query_batch=asking)
-    assert listed_images(nbrs, x, queries=q) == expected
+    assert image_pairs(nbrs, x, queries=q) == expected
     assert len(expected) > 60
