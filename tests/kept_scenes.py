@@ -1,5 +1,7 @@
 """Scenes of lists that are kept in a box, in which nearest images are the sources themselves, or one vector away, or many."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,9 +16,8 @@ def narrow_box(side, dtype, n=4):
     x = jnp.asarray(rng.uniform(0, side, (n, 2)), dtype)
     nbrs = jfrnn.search(x, 0.98, skin=0.02, box=box, capacity=n)
     assert nbrs.images is None
-    of_list = jax.jit(
-        lambda nbrs, x: (jfrnn.pair_sum(lambda r, i, j: jnp.append(r, 1), x, None, neighbors=nbrs), nbrs.distances(x))
-    )
+    summed = functools.partial(jfrnn.pair_sum, lambda r, i, j: jnp.append(r, 1))
+    of_list = jax.jit(lambda nbrs, x: (summed(x, None, neighbors=nbrs), nbrs.distances(x)))
     for _ in range(60):
         x = jnp.asarray(rng.uniform(0, side, (n, 2)), dtype)
         found, (distances, mask) = of_list(nbrs.update(x), x)

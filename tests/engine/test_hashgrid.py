@@ -122,9 +122,8 @@ def test_the_program_names_the_cutoff():
     x = jnp.zeros((5, 3), jnp.float32)
     names = set()
     for cutoff in (0.25, 4.0, 0.3, np.nextafter(np.float32(0.3), np.float32(1))):
-        text = (
-            jax.jit(lambda x, r=cutoff: jfrnn.count(x, r, backend="hashgrid")).trace(x).lower(lowering_platforms=("cpu",)).as_text()
-        )
+        counted = jax.jit(lambda x, r=cutoff: jfrnn.count(x, r, backend="hashgrid"))
+        text = counted.trace(x).lower(lowering_platforms=("cpu",)).as_text()
         names |= set(re.findall(r'kernel = "(jfrnn_hashgrid_cpu_3d_f32_own_dropself_0x[^"]+)@', text))
     assert len(names) == 4
 

@@ -330,9 +330,8 @@ def test_a_program_for_cuda_is_made_ready_on_a_device_of_the_process(monkeypatch
     found, shapes, laid = launch.Call("ready", ["x"], {}, lambda *_: Plan([], {})), {"x": (3,)}, []
     monkeypatch.setattr(launch, "_read_call", lambda name, recipe: (found, shapes))
     monkeypatch.setattr(launch, "multiprocessors_of", lambda device: laid.append(device) or 1)
-    monkeypatch.setattr(
-        jax, "local_devices", lambda backend: [types.SimpleNamespace(local_hardware_id=3)] if backend == "cuda" else 1 / 0
-    )
+    own = types.SimpleNamespace(local_hardware_id=3)
+    monkeypatch.setattr(jax, "local_devices", lambda backend: [own] if backend == "cuda" else 1 / 0)
     monkeypatch.setattr(_driver, "driver", lambda: ctypes.pythonapi)
     launch._keep_plan("ready@here@3", "made so", -2)
     launch._keep_plan("ready@here@3", "made so", 3)
@@ -416,10 +415,8 @@ def test_programs_are_compiled_beside_each_other_and_each_once(monkeypatch, tmp_
 
 def test_a_program_that_is_being_made_begins_to_compile_and_its_call_waits(monkeypatch):
     """A plan is laid when all that it launches is compiled."""
-    job, laid = Future(), []
-    monkeypatch.setattr(
-        launch, "_read_call", lambda name, recipe: (launch.Call("begun", ["x"], {}, lambda *_: "plan"), {"x": (3,)})
-    )
+    job, laid, call = Future(), [], launch.Call("begun", ["x"], {}, lambda *_: "plan")
+    monkeypatch.setattr(launch, "_read_call", lambda name, recipe: (call, {"x": (3,)}))
     monkeypatch.setattr(launch, "begin_programs", lambda plan, device: [job] if not job.done() else [])
     monkeypatch.setattr(launch, "lay_plan", lambda *given: laid.append(given) or plans.lay_plan("begun@", Plan([], {}), {}, -1))
     launch._keep_plan("begun@here@3", "made so", launch._CPU_SOON)

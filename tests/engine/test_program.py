@@ -45,10 +45,8 @@ def test_arguments_that_are_derived_stand_behind_those_of_their_bases():
     ],
 )
 def test_what_is_no_array_and_no_integer_is_refused(line):
-    with pytest.raises(
-        ValueError, match=re.escape(f"WorkArguments must hold arrays of real and int, and integers alone, got '{line}'")
-    ):
-        read_fields(struct("int n;", line, "int m;"), "WorkArguments")
+    said = re.escape(f"WorkArguments must hold arrays of real and int, and integers alone, got '{line}'")
+    refuses(ValueError, said, read_fields, struct("int n;", line, "int m;"), "WorkArguments")
 
 
 def test_the_compiler_refuses_arguments_that_were_not_read():

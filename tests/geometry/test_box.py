@@ -77,9 +77,8 @@ def expected_images(name, dtype, dim, closed):
 
 
 # More images than a cutoff needs, in 3D, so that cases share a program.
-IMAGES = dict.fromkeys(("thin_slab", "thin_wire"), (2, 2, 2)) | dict.fromkeys(
-    ("alone", "alone_ties", "cutoff_2.5_boxes"), (4, 4, 4)
-)
+IMAGES = dict.fromkeys(("thin_slab", "thin_wire"), (2, 2, 2))
+IMAGES |= dict.fromkeys(("alone", "alone_ties", "cutoff_2.5_boxes"), (4, 4, 4))
 IMAGES |= dict.fromkeys(("narrow", "nearly_parallel", "hexagonal", "fcc_primitive", "alone_skewed"), (5, 4, 4))
 IMAGES |= dict.fromkeys(("cutoff_1.5_skewed", "skewed_3_small", "far_from_reduced_crowded"), (5, 4, 4))
 

@@ -175,9 +175,7 @@ def test_known_numbers_of_neighbors_at_long_cutoffs(backend):
     edge, cutoff = 3.567, 95 * 0.529177210903
     diamond = edge / 2 * np.array([[0.0, 1.0, 1.0], [1.0, 0.0, 1.0], [1.0, 1.0, 0.0]])
     boxes = np.stack([diamond, 3.0 * np.eye(3), diamond, 60.0 * np.eye(3)])
-    atoms = (
-        edge / 4 * np.array([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0], [0.5, 0.5, 0.5], [0.0, 0.0, 0.0], [1.0, 1.0, 1.0], [0.0, 0.0, 0.0]])
-    )
+    atoms = edge / 4 * np.array([[0, 0, 0], [1, 1, 1], [0.5, 0.5, 0.5], [0, 0, 0], [1, 1, 1], [0, 0, 0]])
     away = np.arange(-17, 18) ** 2
     cubic = int((9 * (away[:, None, None] + away[:, None] + away) < cutoff**2).sum()) - 1
     given = {"box": jfrnn.Box(boxes), "batch": np.array([0, 0, 1, 2, 2, 3]), "backend": backend}

@@ -39,14 +39,13 @@ def cutoffs(dtype):
     return st.one_of(st.floats(low, high, width=width), st.integers(1, 100).map(float))
 
 
+EACH = itertools.product(("warp", "hashgrid", "jax", "brute"), (np.float32, np.float64))
 OFTEN = [("warp", np.float32), ("warp", np.float64), ("hashgrid", np.float32)]  # the array engines compile slowly
 
 
 @hypothesis.settings(max_examples=50, deadline=None)
 @hypothesis.given(st.data())
-@pytest.mark.parametrize(
-    ("backend", "dtype"), sparing(itertools.product(("warp", "hashgrid", "jax", "brute"), (np.float32, np.float64)), OFTEN)
-)
+@pytest.mark.parametrize(("backend", "dtype"), sparing(EACH, OFTEN))
 def test_any_floats(backend, dtype, data):
     points = data.draw(hnp.arrays(dtype, (POINTS, 3), elements=floats(dtype)))
     cutoff, closed = data.draw(cutoffs(dtype)), data.draw(st.booleans())

@@ -74,9 +74,8 @@ def search_case(name, dtype, dim, rule, backend, way="few", **options):
 
 
 def assert_case(name, dtype, dim, rule, backend, closed=False, masked=True, way="few"):
-    nbrs, x, queries = search_case(
-        name, dtype, dim, rule, backend, way, closed=closed, capacity=CAPACITY if way != "crowd" else 512
-    )
+    capacity = CAPACITY if way != "crowd" else 512
+    nbrs, x, queries = search_case(name, dtype, dim, rule, backend, way, closed=closed, capacity=capacity)
     assert jfrnn.Status(int(nbrs.status)) == jfrnn.Status.NONFINITE  # the padding
     expected = expected_pairs(name, dtype, dim, rule, closed, way)
     checked.assert_same(image_pairs(nbrs, x, **queries), expected)
@@ -172,10 +171,8 @@ def test_each_rule_differs_and_equal_radii_agree_with_one_cutoff():
     found = [expected_pairs("spread_100", np.float32, 3, rule) for rule in RULES]
     assert len(set(map(frozenset, found))) == len(RULES)
     assert found[3] < found[0] < found[2]  # both, gather, either
-    x = RADII_CASES["spread_100"].build(np.float64, 3).positions
-    nbrs = jfrnn.search(
-        checked.padded(x, LENGTH), np.full(LENGTH, 0.2), radius_rule="mean", capacity=CAPACITY, closed=False, backend="warp"
-    )
+    x, options = RADII_CASES["spread_100"].build(np.float64, 3).positions, {"radius_rule": "mean", "backend": "warp"}
+    nbrs = jfrnn.search(checked.padded(x, LENGTH), np.full(LENGTH, 0.2), capacity=CAPACITY, closed=False, **options)
     assert set(reference.pairs_of(np.asarray(nbrs.idx), np.asarray(nbrs.count), LENGTH)) == reference.reference_pairs(x, 0.2)
 
 

@@ -34,9 +34,8 @@ def test_edges_are_the_pairs(kind, box):
     nbrs, x, q = lists.make(kind, "warp", box)
     (m, n), total = (nbrs.idx.shape[0], len(x)), int(np.asarray(nbrs.count).sum()) + 9
     x = np.asarray(x) + 0.01 * np.sin(50 * np.asarray(x))  # with pairs of the skin in the midst of rows
-    edges, pairs = jax.jit(lambda nbrs, x, q: (nbrs.edges(x, total, queries=q), nbrs.pairs(total, positions=x, queries=q)))(
-        nbrs, x, q
-    )
+    both = jax.jit(lambda nbrs, x, q: (nbrs.edges(x, total, queries=q), nbrs.pairs(total, positions=x, queries=q)))
+    edges, pairs = both(nbrs, x, q)
     edges, expected = jax.tree.map(np.asarray, edges), oracle(kind, box, x, q)
     held = len(expected)
     assert 0 < held < total - 9

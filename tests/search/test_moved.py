@@ -83,10 +83,8 @@ def test_points_that_are_not_finite_move_when_they_become_finite(dim, dtype):
 def test_skins_whose_squares_are_no_floats_that_kernels_compare(skin, box):
     """Array programs compare them in another unit, and are asked."""
     x = np.asarray([[0, 0, 0], [1.25, 0, 0]], np.float32)
-    length = LENGTH * max(1, skin)
-    nbrs = jfrnn.search(
-        jnp.asarray(x), CUTOFF, skin=skin, box=jfrnn.Box(np.full(3, length, np.float32)) if box == "box" else None, capacity=2
-    )
+    box = jfrnn.Box(np.full(3, LENGTH * max(1, skin), np.float32)) if box == "box" else None
+    nbrs = jfrnn.search(jnp.asarray(x), CUTOFF, skin=skin, box=box, capacity=2)
     x[1, 0] = 0.5
     after = nbrs.update(jnp.asarray(x))
     assert int(after.rebuild_count) == (skin < 1)

@@ -88,11 +88,9 @@ def pressure(x, m, backend="warp", **options):
 
 def several(x, m, backend="warp", **options):
     """Return three sums over the same pairs, one of which takes a number that the program computes before."""
-    scale = jnp.exp(m.mean())
+    scale, numbers = jnp.exp(m.mean()), jnp.arange(N, dtype=x.dtype)
     one = jfrnn.pair_sum(lambda r, i, j: r @ r, x, CUTOFF, backend=backend, **options)
-    two = jfrnn.pair_sum(
-        lambda r, i, j: (j, scale * r), x, CUTOFF, jnp.arange(float(N)).astype(x.dtype), backend=backend, **options
-    )
+    two = jfrnn.pair_sum(lambda r, i, j: (j, scale * r), x, CUTOFF, numbers, backend=backend, **options)
     return one, two, density(x, m, backend, **options)
 
 

@@ -139,9 +139,8 @@ def test_values_of_all_kinds(dtype):
     fn = functools.partial(of_all_kinds, jnp.asarray(1.5, dtype))
     found = fused(fn, x, 0.3, values)
     i, j, _ = in_order(reference.reference_pairs(x, 0.3), 3)
-    points, matrix, vector, kind, truth = (
-        np.asarray(a).astype(dtype) for a in (x, *map(values.get, ("matrix", "vector", "kind", "heavy")))
-    )
+    given = x, *map(values.get, ("matrix", "vector", "kind", "heavy"))
+    points, matrix, vector, kind, truth = (np.asarray(a).astype(dtype) for a in given)
     r, whole = points[j] - points[i], np.where(truth[j] > 0, kind[j] - 2 * kind[i], 3)
     terms = {"outer": r[:, :, None] * vector[j][:, None], "rest": [1.5 * whole, np.maximum(r, 0)]}
     terms["turned"] = np.einsum("pab,pb->pa", matrix[j], vector[i] - vector[j])

@@ -68,9 +68,8 @@ def rows_to_compare(inputs, real):
     """In float64 XLA takes denormals for 0; it is not asked about them."""
     if real == "float32":
         return np.ones(N, bool)
-    return np.all(
-        [np.all(np.abs(x.reshape(N, -1)) >= np.finfo(real).tiny, 1) | np.all(x.reshape(N, -1) == 0, 1) for x in inputs], 0
-    )
+    tiny, rows = np.finfo(real).tiny, [x.reshape(N, -1) for x in inputs]
+    return np.all([np.all(np.abs(x) >= tiny, 1) | np.all(x == 0, 1) for x in rows], 0)
 
 
 def assert_close(found, expected, ulp, scale, rows, inputs):

@@ -340,9 +340,7 @@ def test_rays_without_warp(dim, dtype):
     for name, parts in walls(dim).items():
         vertices, faces = joined(*parts)
         vertices, x = vertices.astype(dtype), around(dim, dtype)
-        (inside, unknown), (surely, still) = (
-            tuple(np.asarray(part) for part in cast) for cast in cast_both_ways(vertices, faces, x)
-        )
+        (inside, unknown), (surely, still) = jax.tree.map(np.asarray, cast_both_ways(vertices, faces, x))
         apart = ~unknown & ~still
         assert np.array_equal(inside[apart], surely[apart])
         expected, on_face = expected_side(x[SOME], vertices, faces, name)

@@ -109,9 +109,8 @@ BROKEN = {"cut.toml": b"methods = [", "bytes.toml": b"\xff\xfe\x00", "unknown.to
 
 @pytest.mark.parametrize("command", ["run", "bench sums", "bench ties", "bench distributed", "gpu", "sph speed"])
 def test_configs_that_are_none(tmp_path, command):
-    assert refused(*command.split(), tmp_path / "none.toml", "--out", tmp_path / "out").startswith(
-        f"{tmp_path / 'none.toml'}: cannot be read (No such"
-    )
+    none = tmp_path / "none.toml"
+    assert refused(*command.split(), none, "--out", tmp_path / "out").startswith(f"{none}: cannot be read (No such")
     assert refused(*command.split(), tmp_path, "--out", tmp_path / "out").startswith(f"{tmp_path}: cannot be read (Is a directory)")
     for name, text in BROKEN.items():
         (tmp_path / name).write_bytes(text)

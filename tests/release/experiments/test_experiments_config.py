@@ -33,9 +33,8 @@ def test_specs_are_the_product_of_scenes_and_methods(tmp_path):
     config = load(tmp_path, GOOD)
     specs = list(config.specs())
     scenes = [("corners", 0.02), ("corners", 0.11), ("clusters7", 0.02), ("clusters7", 0.11), ("full", None)]
-    assert [(spec.layout, spec.fill, spec.method) for spec in specs] == [
-        (layout, fill, method) for layout, fill in scenes for method in ("scipy-kdtree", "cll")
-    ]
+    expected = [(*scene, method) for scene in scenes for method in ("scipy-kdtree", "cll")]
+    assert [(spec.layout, spec.fill, spec.method) for spec in specs] == expected
     assert len({spec.key for spec in specs}) == len(specs)
 
 
@@ -77,9 +76,8 @@ def test_limits_of_time_change_no_key_but_rows_that_they_cut_short_are_wanted_ag
     short, long = (load(tmp_path, f"most_seconds = {most}\ntimeout = {2 * most}\n" + GOOD) for most in (1.0, 9.0))
     assert [spec.key for spec in short.specs()] == [spec.key for spec in long.specs()]
     spec, later = next(short.specs()), next(long.specs())
-    row = _rows.SearchRow(
-        **{name: getattr(spec, name) for name in ("key", "layout", "method", *_rows.SCENE_FIELDS)}, fill_asked=spec.fill
-    )
+    asked = {name: getattr(spec, name) for name in ("key", "layout", "method", *_rows.SCENE_FIELDS)}
+    row = _rows.SearchRow(**asked, fill_asked=spec.fill)
     assert spec.repeats == 5
     for seconds, again in (([0.6, 0.6], False), ([0.3] * 5, False), ([0.5], True)):
         assert spec.is_cut_short(replace(row, status="ok", seconds=seconds)) is again
@@ -131,9 +129,7 @@ def test_thesis_config_holds_every_scene_of_table_6_1():
     assert all(spec.repeats >= 20 and spec.dtype == "float32" for spec in specs)
 
 
-@pytest.mark.parametrize(
-    "path", sorted(set(CONFIGS.glob("sweep_*.toml")) | set(CONFIGS.glob("thesis*.toml"))), ids=lambda path: path.stem
-)
+@pytest.mark.parametrize("path", sorted([*CONFIGS.glob("sweep_*.toml"), *CONFIGS.glob("thesis*.toml")]), ids=lambda path: path.stem)
 def test_every_scene_of_a_config_can_be_made(path):
     specs = {spec.scene_key: spec for spec in _config.load(path).specs()}
     for spec in specs.values():

@@ -52,9 +52,8 @@ def test_rows_of_a_tiny_run(tmp_path):
 def test_all_kinds_of_work(tmp_path):
     _, rows = run(tmp_path, (ROOT / "experiments/configs/distributed_smoke.toml").read_text().replace("side = 12", "side = 6"))
     assert {row["status"] for row in rows} == {"ok"}, rows
-    assert {(row["scaling"], row["work"]) for row in rows} == {
-        (s, w) for s in ("strong", "weak") for w in ("list", "pair_sum", "sph")
-    }
+    expected = {(s, w) for s in ("strong", "weak") for w in ("list", "pair_sum", "sph")}
+    assert {(row["scaling"], row["work"]) for row in rows} == expected
     assert {row["differing"] for row in rows if row["devices"] > 1} == {0}
 
 

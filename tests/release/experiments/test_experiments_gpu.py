@@ -8,7 +8,7 @@ from dataclasses import replace
 import jax
 import numpy as np
 import pytest
-from checked import refuses
+from checked import refuses, slow
 from commanded import invoke, told
 from places import ROOT
 
@@ -89,9 +89,7 @@ def test_an_inexact_answer_is_counted_as_wrong(monkeypatch):
     assert [row["wrong"] for row in decided(part)] == [2]
 
 
-@pytest.mark.parametrize(
-    ("table", "name"), [("radii", "queries"), pytest.param("batches", "periodic_images", marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize(("table", "name"), [("radii", "queries"), slow("batches", "periodic_images")])
 def test_options_are_decided_case_by_case(table, name, monkeypatch):
     """The second config names these tables; here one case of each."""
     module = importlib.import_module(f"jfrnn.cases.{table}")

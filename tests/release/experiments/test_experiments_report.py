@@ -40,11 +40,10 @@ def make_row(scene, method, seconds, megabytes, **options):
 
 def make_rows():
     rows = []
+    skipped = {"status": "skipped", "reason": "too many", "median_s": None, "search_bytes": None, "missing": None}
     for number, scene in enumerate(SCENES, start=1):
         rows.append(make_row(scene, "jax", 0.5 * number, 40.0 * number))
-        rows.append(
-            make_row(scene, "brute", 0, 0, status="skipped", reason="too many", median_s=None, search_bytes=None, missing=None)
-        )
+        rows.append(make_row(scene, "brute", 0, 0, **skipped))
         rows.append(make_row(scene, "scipy-kdtree", 0.75 * number, 20.0 * number, extra=300 * number))
         rows.append(make_row(scene, "cll", 0.25 * number, 10.0 * number, missing=2 * number, extra=7))
     return rows
@@ -195,9 +194,8 @@ def test_pictures_that_lead_have_eight_methods_each_with_its_name_and_marker(man
 
 
 def test_all_methods_are_in_a_second_picture(many):
-    assert {_look.name_of(method) for method in MANY} <= {
-        axes.get_title(loc="left") for axes in _plots.of_all(many, _plots.TIME).axes
-    }
+    titles = {axes.get_title(loc="left") for axes in _plots.of_all(many, _plots.TIME).axes}
+    assert {_look.name_of(method) for method in MANY} <= titles
 
 
 def test_titles_say_what_the_rows_say(many):
@@ -205,15 +203,13 @@ def test_titles_say_what_the_rows_say(many):
     assert said["runtime_by_layout"] == "jfrnn's list is 5 times as fast as the next, cell lists (thesis), on all 4 scenes"
     lean = "jfrnn's list takes 0.2 times the memory of the leanest other, cell lists (thesis) (means of layouts)"
     assert said["memory_by_fill"] == lean
-    assert said["speed_against_error"].startswith(
-        "5 of the 7 lists drawn are exact; the fastest of the others, cell lists (thesis), takes 5 times"
-    )
+    exact = "5 of the 7 lists drawn are exact; the fastest of the others, cell lists (thesis), takes 5 times"
+    assert said["speed_against_error"].startswith(exact)
     assert said["speed_against_sum_error"].startswith("Wrong pairs change a sum that jumps at the cutoff by up to 1 %")
     slow = [replace(row, median_s=0.05) if row.method == "vesin" and row.layout == "full" else row for row in many]
     title = _plots.by_layout(slow, _plots.TIME).get_suptitle().replace("\n", " ")
-    assert title.startswith(
-        "jfrnn's list is first on 3 of 4 scenes, up to 5 times as fast as the next; elsewhere up to 2 times as slow as"
-    )
+    most = "jfrnn's list is first on 3 of 4 scenes, up to 5 times as fast as the next; elsewhere up to 2 times as slow as"
+    assert title.startswith(most)
 
 
 def test_names_beside_marks_cover_neither_a_mark_nor_each_other(many):
@@ -226,9 +222,8 @@ def test_names_beside_marks_cover_neither_a_mark_nor_each_other(many):
     points = axes.transData.transform([mark[1:3] for mark in marks])
     assert not any(one.overlaps(other) for k, one in enumerate(boxes) for other in boxes[:k])
     assert not any(box.contains(*point) for box in boxes for point in points)
-    assert all(
-        axes.bbox.x0 <= box.x0 and box.x1 <= axes.bbox.x1 and axes.bbox.y0 <= box.y0 and box.y1 <= axes.bbox.y1 for box in boxes
-    )
+    frame = axes.bbox
+    assert all(frame.x0 <= box.x0 and box.x1 <= frame.x1 and frame.y0 <= box.y0 and box.y1 <= frame.y1 for box in boxes)
 
 
 def test_fills_are_those_that_were_made(many):

@@ -70,9 +70,8 @@ def test_nvcc_compiles_headers(tmp_path):
     pieces = [f"namespace space_{k} {{\n{text_of(name)}\n}}\n" for k, name in enumerate(headers(cuda=True))]
     source = tmp_path / "headers.cu"
     source.write_text("#include <cuda_fp16.h>\n" + "".join(pieces))
-    done = subprocess.run(
-        [nvcc, "-ptx", "-std=c++17", "-arch=sm_90", "-o", tmp_path / "x.ptx", source], capture_output=True, text=True
-    )
+    command = [nvcc, "-ptx", "-std=c++17", "-arch=sm_90", "-o", tmp_path / "x.ptx", source]
+    done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[:2000]
 
 

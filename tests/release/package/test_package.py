@@ -54,12 +54,11 @@ def wheel(tmp_path_factory):
 
 
 def test_wheel_works_elsewhere(wheel, tmp_path):
-    run(
-        "-m", "pip", "install", "--quiet", "--no-deps", "--no-compile", "--target", str(tmp_path / "site"), str(wheel), cwd=tmp_path
-    )
-    said = run("-c", SEARCH.format(folder=str(tmp_path), engine="warp"), cwd=tmp_path, PYTHONPATH=str(tmp_path / "site"))
+    site = str(tmp_path / "site")
+    run("-m", "pip", "install", "--quiet", "--no-deps", "--no-compile", "--target", site, wheel, cwd=tmp_path)
+    said = run("-c", SEARCH.format(folder=str(tmp_path), engine="warp"), cwd=tmp_path, PYTHONPATH=site)
     assert int(said.split()[-1]) > 0
-    run(*FLUID, "--no-pictures", cwd=tmp_path, PYTHONPATH=str(tmp_path / "site"))
+    run(*FLUID, "--no-pictures", cwd=tmp_path, PYTHONPATH=site)
     assert (tmp_path / "out/sph/one/snapshots/000000002.vtp").exists()
 
 

@@ -208,6 +208,5 @@ def test_meshes_are_read(tmp_path, kind):
     solid = read_solid(path)
     points, named = solid.vertices, solid.faces
     assert (points.shape, named.shape, named.dtype) == (vertices.shape, faces.shape, np.int32)
-    assert np.allclose(
-        np.sort(points[named].reshape(len(faces), -1), axis=0), np.sort(vertices[faces].reshape(len(faces), -1), axis=0), atol=1e-6
-    )
+    found, given = (np.sort(corners.reshape(len(faces), -1), axis=0) for corners in (points[named], vertices[faces]))
+    assert np.allclose(found, given, atol=1e-6)

@@ -65,9 +65,8 @@ def test_kernels_behind_a_plane(name, dim):
 def test_a_lattice_beside_a_wall_feels_no_gradient():
     """Gradients of the kernel over a lattice that ends at a plane, and the plane's integral, cancel."""
     spacing, h, kernel = 0.1, 0.15, KERNELS["wendland2"]
-    sites = (
-        np.stack(np.meshgrid(np.arange(-6, 7), np.arange(-6, 7), np.arange(8) + 0.5, indexing="ij"), -1).reshape(-1, 3) * spacing
-    )
+    places = np.meshgrid(np.arange(-6, 7), np.arange(-6, 7), np.arange(8) + 0.5, indexing="ij")
+    sites = np.stack(places, -1).reshape(-1, 3) * spacing
     for layer in range(3):
         here = np.array([0, 0, (layer + 0.5) * spacing])
         r = sites - here

@@ -124,9 +124,8 @@ def test_rows_are_kept_and_missed_targets_say_so(tmp_path, monkeypatch):
 
 def test_a_run_that_diverges_is_a_row(tmp_path, monkeypatch):
     wild = replace(SHORT, judge=lambda scene, seen: ([Figure("nothing", np.nan, None, 1.0)], {}))
-    assert validate.measure("wild", wild, str)["figures"] == [
-        {"quantity": "nothing", "measured": None, "low": None, "high": 1.0, "met": False}
-    ]
+    nothing = {"quantity": "nothing", "measured": None, "low": None, "high": 1.0, "met": False}
+    assert validate.measure("wild", wild, str)["figures"] == [nothing]
     monkeypatch.setattr(validate.health, "complaint", lambda scene, s: "particle 0 is gone")
     row = validate.measure("wild", wild, str)
     assert (row["figures"], row["reason"]) == ([], "diverged until t = 0.001 s: particle 0 is gone")

@@ -8,6 +8,7 @@ import jax
 import numpy as np
 import pytest
 import travelled
+from checked import refuses
 from jax.experimental import serialize_executable
 from jax.experimental.compilation_cache import compilation_cache
 from places import TESTS
@@ -80,10 +81,8 @@ def test_symbols_in_shapes_are_refused(backend):
     wall = np.zeros((4, 3), np.float32)
 
     def refused(function, x, name, symbol):
-        with pytest.raises(
-            ValueError, match=rf"^{name} must have a shape of numbers, got \({symbol}, 3\): .*Export one program for each"
-        ):
-            jax.export.export(jax.jit(function), disabled_checks=SAFE)(x)
+        said = rf"^{name} must have a shape of numbers, got \({symbol}, 3\): .*Export one program for each"
+        refuses(ValueError, said, jax.export.export(jax.jit(function), disabled_checks=SAFE), x)
 
     refused(lambda x: jfrnn.search(x, 0.1, capacity=8, backend=backend), many, "positions", "n")
     refused(lambda x: jfrnn.count(wall, 0.1, queries=x, backend=backend), many, "queries", "n")
