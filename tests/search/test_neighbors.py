@@ -109,12 +109,10 @@ def test_is_a_pytree_with_static_options(points):
 
 def test_refusals(points):
     nbrs = search(points, 0.4)
-
     refuses(ValueError, "made without queries: leave queries out", nbrs.vectors, points, queries=points)
     refuses(TypeError, "positions must be float32 or float64", nbrs.vectors, points.astype(int))
     asked = search(points, 0.4, queries=points[:3])
     refuses(ValueError, "made with queries: pass queries=", asked.distances, points)
-
     with pytest.raises(TypeError, match=r"check\(\) reads values and cannot run inside jax.jit"):
         jax.jit(lambda x: jfrnn.search(x, 0.4, capacity=40).check())(points)
     batch = jax.vmap(lambda x: jfrnn.search(x, 0.4, capacity=40))(points[None])

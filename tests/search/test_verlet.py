@@ -273,5 +273,4 @@ def test_refusals(dim):
         jfrnn.search(x, CUTOFF, active=np.ones(9, bool))
     nbrs = jfrnn.search(x, CUTOFF, skin=SKIN)
     refuses(ValueError, "this list was made without active: leave active out", nbrs.update, x, active=np.ones(10, bool))
-
     refuses(ValueError, "this list was made with active: pass active=", jfrnn.search(x, CUTOFF, active=np.ones(10, bool)).update, x)

@@ -612,7 +612,6 @@ def test_vmap_and_scan(backend):
 def test_derivatives_of_vmap():
     x, m = scene(1)
     nbrs, pairs = jfrnn.search(x, CUTOFF, backend="warp"), reference.reference_pairs(x, CUTOFF)
-
     scales = np.array([1.0, 2.0])
 
     @jax.jit

@@ -1,4 +1,4 @@
-"""Benches of lists, and what they share: ways that are right are timed, and nothing wrong is."""
+"""Benches of lists, those of triangles too, and what they share: ways that are right are timed, and nothing wrong is."""
 
 import jax
 import numpy as np
@@ -7,7 +7,7 @@ import pytest
 from commanded import told
 
 from experiments import methods
-from experiments.bench import arrays, crystals, latency, lists, structures, table
+from experiments.bench import arrays, crystals, latency, lists, structures, table, triangles
 
 N = 16
 SUMS = ("list", "counts", "density", "density, gradient")
@@ -118,3 +118,15 @@ def test_every_kind_of_sites_gets_a_row_that_was_checked(tmp_path):
     whole = found[found["sites"].isin(["spacing 1", "spacing 1/64"])]["neighbors"]
     assert whole.nunique() == 1  # strictly less: no tie is a pair
     assert (found[["count_s", "list_s", "density_s"]] > 0).all(axis=None)
+
+
+def test_libraries_that_find_nearest_triangles_agree(tmp_path):
+    text = triangles.command(tmp_path, 500, [500], [0.5], 2, "warp")
+    rows = pd.read_csv(tmp_path / "cpu_warp.csv")
+    assert list(rows["method"])[:3] == ["jfrnn warp update", "jfrnn warp rebuild", "jfrnn warp count"]
+    assert "trimesh" in set(rows["method"])
+    assert {"jfrnn warp update, hilbert order", "jfrnn bvh update, hilbert order"} < set(rows["method"])
+    assert (rows["processor_s"] > 0).all()
+    peers = rows[rows["method"].isin(["trimesh", "libigl", "wp.Mesh nearest"])]
+    assert not peers[["missing", "extra"]].to_numpy().any()
+    assert "us_per_particle" in text
