@@ -185,10 +185,8 @@ def test_sums_of_counts_never_wrap():
     np.testing.assert_array_equal(offsets, np.minimum(exact, 2**31 - 1))
     assert (offsets.dtype, int(pair_total(jnp.asarray(counts), capacity))) == (np.int32, 2**31 - 1)
     assert int(pair_total(jnp.asarray(counts[[0, 2, 5]]), capacity)) == 12
-    many = jax.eval_shape(
-        lambda idx, count: flat_pairs(idx, count, 64_000_000, 8),
-        *(jax.ShapeDtypeStruct(shape, np.int32) for shape in ((64_000_000, 112), (64_000_000,))),
-    )
+    given = (jax.ShapeDtypeStruct(shape, np.int32) for shape in ((64_000_000, 112), (64_000_000,)))
+    many = jax.eval_shape(lambda idx, count: flat_pairs(idx, count, 64_000_000, 8), *given)
     assert many[2].dtype == np.int32
 
 

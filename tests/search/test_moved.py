@@ -42,13 +42,8 @@ def test_one_point_that_moves_decides(dim, dtype, box):
     nbrs = a_list(x, BOXES[box])
     assert answers(nbrs, x) == [False, False]
     along_all = half / np.sqrt(dim)
-    motions = [
-        ([half * 0.999], False),
-        ([half * 1.001], True),
-        ([along_all * 0.999] * dim, False),
-        ([along_all * 1.001] * dim, True),
-    ]
-    motions += [([0, -half * 0.999], False), ([0, -half * 1.001], True), ([np.nan], True), ([np.inf], True)]
+    motions = [([half * 0.999], False), ([half * 1.001], True), ([0, -half * 0.999], False), ([0, -half * 1.001], True)]
+    motions += [([along_all * 0.999] * dim, False), ([along_all * 1.001] * dim, True), ([np.nan], True), ([np.inf], True)]
     for place in range(0, n, n // 4):
         for motion, stale in motions:
             moved = x.copy()

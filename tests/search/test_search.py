@@ -21,15 +21,8 @@ def random_points(n, dim, dtype, seed=0):
 
 SLOW = pytest.mark.slow
 BRUTE = slow("brute")  # its filters and rows are those of "jax", and it compiles as slowly
-OPTIONS = [
-    {},
-    {"half": True},
-    {"include_self": True},
-    {"closed": True},
-    {"half": True, "include_self": True},
-    {"half": True, "closed": True},
-    {"half": True, "include_self": True, "closed": True},
-]
+HALF, SELF, CLOSED = {"half": True}, {"include_self": True}, {"closed": True}
+OPTIONS = [{}, HALF, SELF, CLOSED, HALF | SELF, HALF | CLOSED, HALF | SELF | CLOSED]
 
 
 def each_option():

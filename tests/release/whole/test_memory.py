@@ -280,29 +280,18 @@ def test_auto_plans_the_engine_that_would_run():
 
 def test_the_plan_reads_well():
     plan = jfrnn.MemoryPlan(list_bytes=12_345_678, scratch_bytes=1_000_000, backend="jax")
-    assert str(plan).splitlines() == [
-        "one search with backend='jax', beside the positions:",
-        "  list         12.35 MB",
-        "  scratch       1.00 MB",
-        "  total        13.35 MB",
-    ]
+    scratch, total = "  scratch       1.00 MB", "  total        13.35 MB"
+    head = "one search with backend='jax', beside the positions:"
+    assert str(plan).splitlines() == [head, "  list         12.35 MB", scratch, total]
     with pytest.raises(dataclasses.FrozenInstanceError):
         plan.backend = "warp"
     plan = jfrnn.MemoryPlan(list_bytes=0, scratch_bytes=1_000_000, backend="warp", counts_bytes=400_000)
-    assert str(plan).splitlines() == [
-        "one count with backend='warp', beside the positions:",
-        "  counts        0.40 MB",
-        "  scratch       1.00 MB",
-        "  total         1.40 MB",
-    ]
+    head = "one count with backend='warp', beside the positions:"
+    assert str(plan).splitlines() == [head, "  counts        0.40 MB", scratch, "  total         1.40 MB"]
     assert str(jfrnn.memory_plan(0, 0.1, backend="warp")).startswith("one count")
     plan = jfrnn.MemoryPlan(list_bytes=0, scratch_bytes=1_000_000, backend="warp", sums_bytes=12_345_678)
-    assert str(plan).splitlines() == [
-        "one pair sum with backend='warp', beside the positions and values:",
-        "  sums         12.35 MB",
-        "  scratch       1.00 MB",
-        "  total        13.35 MB",
-    ]
+    head = "one pair sum with backend='warp', beside the positions and values:"
+    assert str(plan).splitlines() == [head, "  sums         12.35 MB", scratch, total]
 
 
 @pytest.mark.parametrize(
