@@ -156,8 +156,8 @@ def test_concrete_arguments_inside_jit_are_checked(curve):
 @pytest.mark.parametrize(
     ("curve", "kind"),
     [
-        *(("morton", kind) for kind in (np.int8, np.int16, np.uint64)),
-        *(("hilbert", kind) for kind in (np.uint8, np.uint32, np.int64)),
+        *itertools.product(["morton"], [np.int8, np.int16, np.uint64]),
+        *itertools.product(["hilbert"], [np.uint8, np.uint32, np.int64]),
     ],
 )
 def test_every_integer_type_gives_the_same_keys(curve, kind):
