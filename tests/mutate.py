@@ -31,7 +31,7 @@ from rich.table import Table
 ROOMS = {path.stem: path for path in sorted((ROOT / "tests" / "mutants").glob("*.toml"))}
 ROWS = ROOT / "out" / "mutants.jsonl"
 LONGEST = 600  # that the tests of a fault may take [s]; one that never ends is noticed, too
-PYTEST = ["-m", "pytest", "-x", "-q", "-n", "0", "-p", "no:cacheprovider", "--no-header", "--tb=line"]
+PYTEST = ["-m", "pytest", "-x", "-q", "-n", "0", "-p", "no:cacheprovider", "-p", "no:benchmark", "--no-header", "--tb=line"]
 
 
 class Mutant(NamedTuple):

@@ -211,9 +211,8 @@ def table_size(sources: int) -> int:
 
 def _part_of(x: Array, cell: Array, edge: Array) -> Array:
     """Return the part of its cell in which each open coordinate lies, uint32; below 0, cells are mirrored."""
-    from_start = _remainder(
-        jnp.abs(x), jnp.where(x < 0, -1 - cell, cell), edge
-    )  # exactly, unless cells are too far away to resolve
+    # from where its cell begins, exactly unless that is too far away to resolve
+    from_start = _remainder(jnp.abs(x), jnp.where(x < 0, -1 - cell, cell), edge)
     part = cell_coordinate(from_start, edge / FINE)
     return jnp.clip(jnp.where(x < 0, FINE - 1 - part, part), 0, FINE - 1).astype(jnp.int32).astype(jnp.uint32)
 

@@ -42,6 +42,7 @@ FUNCTIONS = {
     "a force": (lambda x: -jax.grad(energy)(x) - jax.grad(energy)(x), 19),
     "a force and its derivative": (lambda x: jax.jvp(jax.grad(energy), (x,), (x,)), 60),
     "signs and twos": (lambda x: -(x * x[0] * 3 + x * x[0] * 3), 6),
+    "twice a sign and a constant": (lambda x: -x[0] * 3.0 + -x[0] * 3.0, 1),
     "signs and constants": (lambda x: -(-x[0] * 3.0 * x[1]), 2),
     "some of several": (lambda x: x[0] * x[1] + x[2] + x[0] * x[2] - jnp.sqrt(x[1]), 6),
     "inner brackets": (lambda x: x[0] * x[1] * x[2] + x[0] * x[1] * x[1] + x[0] * x[2], 7),

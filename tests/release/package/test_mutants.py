@@ -6,6 +6,7 @@ import pytest
 from checked import refuses
 from mutate import ROOMS, Mutant, read_mutants
 from places import ROOT
+from started import run_python
 
 
 def functions_of(path):
@@ -19,6 +20,12 @@ def test_faults_stand_once_in_their_files_and_name_tests(room):
         for test in mutant.tests:
             path, _, name = test.partition("::")
             assert not name or name.split("[")[0] in functions_of(path), test
+
+
+def test_all_tests_that_faults_name_are_there():
+    """With their arguments, too: pytest says which it does not find, and no room of such a test runs."""
+    named = sorted({test for mutant in read_mutants(list(ROOMS)) for test in mutant.tests})
+    run_python("-m", "pytest", "--collect-only", "-q", "-n", "0", "-m", "slow or not slow", *named)
 
 
 def test_there_are_enough_for_cpus_and_gpus():
