@@ -113,7 +113,7 @@ struct CellWalk : Walk<Query> {
         end = to;
         system = system_at(begin);
         go_to(system);
-        this->find_group_cutoff();
+        this->begin_group();
         whole first[3] = {0, 0, 0}, last[3] = {0, 0, 0};
         for (int k = 0; k < DIM; ++k) {
             if (is_periodic(k)) {

@@ -115,7 +115,7 @@ struct SumsBy : Way<SumsBy<Way>> {
     void meet_in_place(const real* q, int id, const Term::Own& own_part, Reduction& reduction) {
         const Band<real> of_query{inside, outside};
         const int filled = this->filled;
-        const Excluded mine(excluded_starts, excluded, id);
+        const Excluded mine = this->excluded_by(id);
         unsigned int any_unsure = 0;
         for (int b = 0, v = 0; b < filled; b += LANES, ++v) {
             const Points points = candidates_at(b);
@@ -150,7 +150,7 @@ struct SumsBy : Way<SumsBy<Way>> {
         const Band<real> of_query{inside, outside};
         const int filled = this->filled;
         const ints numbers = first_numbers();
-        const Excluded mine(excluded_starts, excluded, id);
+        const Excluded mine = this->excluded_by(id);
         int held = 0;
         for (int b = 0; b < filled; b += LANES) {
             const Points points = candidates_at(b);

@@ -224,7 +224,7 @@ struct TreeWalk : Walk<Query> {
             own_place[place - from] = own ? this->place_of[query_ids[place]] : NOWHERE;
         }
         own_place[to - from] = NOWHERE;
-        this->find_group_cutoff();
+        this->begin_group();
         next_own = filled = side = 0;
         fresh = true;
         forget();

@@ -171,18 +171,24 @@ struct Scan : SearchArguments, SystemCells, SourcePlaces {
     static constexpr bool NAMED = PERIODIC == 2 && !SUMS;  // ids name images, too
     // The source that a candidate is, or an image of.
     int source_at(int number) const { return NAMED ? candidate_ids[number] % n : candidate_ids[number]; }
+    // What a query excludes. A short row needs no filter: `wanted` compares all of it at once.
+    Excluded excluded_by(int id) const {
+        Excluded mine(excluded_starts, excluded, id, 0);
+        if (EXCLUDING && !is_compared(mine))
+            mine.filter = mine.find_filter();
+        return mine;
+    }
+    static bool is_compared(const Excluded& row) { return EXCLUDING == 1 && !NAMED && row.end - row.begin <= Excluded::MOST_KEPT; }
     // Those of the candidates from number b on, of which some are `near`, that a query does not exclude.
     unsigned int wanted(const Excluded& excluded, int b, unsigned int near) const {
-        const int many = (int)(excluded.end - excluded.begin);
-        unsigned int rest = many > 0 ? near : 0;
-        if constexpr (EXCLUDING == 1 && !NAMED) {  // all at once: a short row, or what the filter tells of a longer one
-            const ints ids = *(const ints*)(candidate_ids + b);
-            if (many <= Excluded::MOST_KEPT) {
-                ints found{};
-                for (int k = 0; k < many; ++k)
-                    found |= ids == excluded.begin[k];
-                return near & ~bits_of_flags(__builtin_convertvector(found, flags));
-            }
+        const ints ids = *(const ints*)(candidate_ids + b);
+        if (is_compared(excluded)) {
+            for (const int* id = excluded.begin; id < excluded.end; ++id)
+                near &= ~bits_of_flags(__builtin_convertvector(ids == *id, flags));
+            return near;
+        }
+        unsigned int rest = excluded.begin < excluded.end ? near : 0;
+        if constexpr (EXCLUDING == 1 && !NAMED) {  // what the filter tells of all at once
             const ints low = ints{} + (int)(unsigned int)excluded.filter,
                        high = ints{} + (int)(unsigned int)(excluded.filter >> 32);
             const ints words = (ids & 32) != 0 ? high : low;
@@ -297,7 +303,7 @@ struct Scan : SearchArguments, SystemCells, SourcePlaces {
     template <bool ONLY_LATER, bool BOUNDED>
     int scan(const real* q, int own_id, int count, int* to, int room) {
         const Band<real> of_query{inside, outside};  // stays in registers, whatever is stored
-        const Excluded mine(excluded_starts, excluded, own_id);
+        const Excluded mine = excluded_by(own_id);
         unsigned int any_unsure = 0;
         int hits = 0;
         for (int b = 0, v = 0; b < count; b += LANES, ++v) {

@@ -40,9 +40,13 @@ struct Walk : Scan {
     Query& query() { return *(Query*)this; }
     const Query& query() const { return *(const Query*)this; }
 
-    // Finds the largest cutoff of the queries that are served.
-    void find_group_cutoff() {
+    // Begins with the queries that are served: finds the largest of their cutoffs, and asks ahead for what stands anywhere.
+    void begin_group() {
         group_radius = 0;
+        for (int place = begin; EXCLUDING && place < end; ++place)
+            __builtin_prefetch(excluded_starts + query_ids[place]);
+        for (int place = begin; RULE == TABLE && place < end; ++place)
+            __builtin_prefetch(kinds_of_queries + query_ids[place]);
         for (int place = begin; DIFFER && RULE != SCATTER && place < end; ++place) {
             const real r = query_radii[query_ids[place]];
             group_radius = r > group_radius ? r : group_radius;
@@ -86,8 +90,11 @@ struct Walk : Scan {
             for (int k = 0; k < DIM; ++k)
                 candidate[k][filled + e] = __builtin_nanf("");
         this->find_bands(filled);
-        for (int place = begin; place < end; ++place)
+        for (int place = begin; place < end; ++place) {
             query().expect(query_ids[place]);
+            if constexpr (EXCLUDING)
+                __builtin_prefetch(excluded + excluded_starts[query_ids[place]]);
+        }
         if constexpr (Query::FLUSHED)
             floats.flush();
         for (int place = begin; place < end; ++place) {
