@@ -139,10 +139,13 @@ struct Near {
         }
         for (int k = 0; k < DIM; ++k)
             row[k] = p[k];
+        put_turns(packed, row);
+        return met;
+    }
+    JFRNN_FUNCTION void put_turns(int packed, real* row) {
         if constexpr (DOUBLE)
             row[DIM] = packed;
         else
             memcpy(row + DIM, &packed, 4);
-        return met;
     }
 };
