@@ -21,4 +21,4 @@ def near_kernel(dim: int, double: bool, skewed: bool, told: tuple[tuple[str, int
     constants = {"CHUNK": POINTS_AT_ONCE, **dict(told)}
     name = f"near_{'cuda' if cuda else 'cpu'}"
     kind = Kind(dim, double, periodic=1 + SKEWED * skewed)
-    return declare_kind(kind, name, "near_rows.h", entry, cuda=cuda, constants=constants)[0]
+    return declare_kind(kind, name, "near_rows.cuh" if cuda else "near_rows_cpu.h", entry, cuda=cuda, constants=constants)[0]

@@ -13,7 +13,8 @@ from checked import sparing
 
 import jfrnn
 from jfrnn._engine import warp
-from jfrnn.kernels import Kind, _compile, cells_cpu, cells_cuda, declare, few_cuda, hashgrid, tree_cuda
+from jfrnn._engine.near_warp import constants_of_far
+from jfrnn.kernels import Kind, _compile, cells_cpu, cells_cuda, declare, few_cuda, hashgrid, near, tree_cuda
 from jfrnn.kernels._native import program
 
 VARIANTS = [(dim, double, False, lists, False) for dim, double, lists in itertools.product((2, 3), (False, True), (False, True))]
@@ -52,6 +53,12 @@ def test_variants_compile(dim, double, scaled, lists, later):
 )
 def test_hashgrid_compiles(dim, double, scaled, lists):
     assert compiles(*hashgrid.search_kernels(Kind(dim, double, scaled=scaled, lists=lists), cuda=True)) == 1
+
+
+@pytest.mark.parametrize("skewed", [False, True])
+def test_rows_of_particles_in_a_box_compile(skewed):
+    for dim, double in ((2, True), (3, False)):
+        assert compiles(near.near_kernel(dim, double, skewed, tuple(constants_of_far(double).items()), cuda=True)) == 1
 
 
 def test_boxes_batches_and_cutoffs_per_particle_compile():
