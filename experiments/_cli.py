@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from experiments import _commands
-from experiments._commands import take_file, take_folder, usage_errors
+from experiments._commands import take_file, take_folder
 from experiments._errors import UsageError
 
 _GPU = {"gpu": ("experiments.bench.gpu", "Decide the hard cases on this device, take timings.")}
@@ -28,17 +28,16 @@ def run(
     shard: Annotated[str, typer.Option(help="K/N: every N-th scene from the K-th on, in OUT/shard-K-of-N.")] = "1/1",
 ) -> None:
     """Run a sweep, or go on with it: rows that are there are not measured again, unless less time cut their repeats short."""
-    with usage_errors():
-        from experiments import _config, _sweep
+    from experiments import _config, _sweep
 
-        part, parts = _read_shard(shard)
-        asked = {"methods": _split(method_names), "layouts": _split(layouts), "fills": _split(fills)}
-        given = _config.narrow(_config.load(config), **asked, processes=processes, most_seconds=most_seconds)
-        folder = out or Path("out") / config.stem
-        folder = take_folder(folder if parts == 1 else folder / f"shard-{part}-of-{parts}")
-        with _commands.stoppable():
-            rows = _sweep.run(given, config.stem, folder, retry_failed, (part, parts))
-        typer.echo(f"{_sweep.count_results(rows)}; rows in {folder / 'rows.jsonl'}")
+    part, parts = _read_shard(shard)
+    asked = {"methods": _split(method_names), "layouts": _split(layouts), "fills": _split(fills)}
+    given = _config.narrow(_config.load(config), **asked, processes=processes, most_seconds=most_seconds)
+    folder = out or Path("out") / config.stem
+    folder = take_folder(folder if parts == 1 else folder / f"shard-{part}-of-{parts}")
+    with _commands.stoppable():
+        rows = _sweep.run(given, config.stem, folder, retry_failed, (part, parts))
+    typer.echo(f"{_sweep.count_results(rows)}; rows in {folder / 'rows.jsonl'}")
 
 
 def _split(text: str | None) -> list[str] | None:
@@ -49,13 +48,12 @@ def _split(text: str | None) -> list[str] | None:
 @app.command(short_help="Write a config to begin a sweep of your own with.")
 def init(path: Annotated[Path, typer.Argument(help="TOML file.")] = Path("sweep.toml")) -> None:
     """Write a config of a small sweep, with every key, its default and what it means."""
-    with usage_errors():
-        from experiments.pages import configs
+    from experiments.pages import configs
 
-        if path.exists():
-            raise UsageError(f"{path}: there is such a file already; name another")
-        take_file(path, "PATH").write_text(configs.example(), encoding="utf-8")
-        typer.echo(f"{path}; run it: python -m experiments run {path}")
+    if path.exists():
+        raise UsageError(f"{path}: there is such a file already; name another")
+    take_file(path, "PATH").write_text(configs.example(), encoding="utf-8")
+    typer.echo(f"{path}; run it: python -m experiments run {path}")
 
 
 def _read_shard(text: str) -> tuple[int, int]:
@@ -69,19 +67,17 @@ def _read_shard(text: str) -> tuple[int, int]:
 @app.command(short_help="Print the tables of a folder of rows, draw pictures.")
 def report(folder: Annotated[Path, typer.Argument(help="Folder with rows.jsonl.")]) -> None:
     """Print the table of what was measured, and write it and pictures beside the rows: of a sweep, beside the thesis's figures."""
-    with usage_errors():
-        from experiments import _report
+    from experiments import _report
 
-        _report.report(folder)
+    _report.report(folder)
 
 
 @app.command(short_help="Make the tables of README.md and docs/ anew.")
 def tables() -> None:
     """Make the tables of README.md and docs/ anew from the rows under experiments/results, and print the pages that changed."""
-    with usage_errors():
-        from experiments import pages
+    from experiments import pages
 
-        typer.echo("\n".join(str(path.relative_to(pages.ROOT)) for path in pages.write()) or "nothing changed")
+    typer.echo("\n".join(str(path.relative_to(pages.ROOT)) for path in pages.write()) or "nothing changed")
 
 
 @app.command(short_help="Put rows of shards, or of machines, together.")
@@ -90,11 +86,10 @@ def merge(
     parts: Annotated[list[Path] | None, typer.Argument(help="Folders with rows; all OUT/shard-* without.")] = None,
 ) -> None:
     """Put the rows of shards, or of other machines, into one folder; a row that is there already is not added."""
-    with usage_errors():
-        from experiments import _sweep
+    from experiments import _sweep
 
-        came = _sweep.merge(take_folder(out, "OUT"), parts or sorted(out.glob("shard-*")))
-        typer.echo(f"{came} rows came; all are in {out / 'rows.jsonl'}")
+    came = _sweep.merge(take_folder(out, "OUT"), parts or sorted(out.glob("shard-*")))
+    typer.echo(f"{came} rows came; all are in {out / 'rows.jsonl'}")
 
 
 @app.command(name="list", short_help="Say what layouts, methods and configs there are.")
@@ -125,13 +120,12 @@ def show(
     out: Annotated[Path | None, typer.Option(help="Picture; out/LAYOUT.png without it.")] = None,
 ) -> None:
     """Draw a layout."""
-    with usage_errors():
-        from experiments import _layouts, _show
+    from experiments import _layouts, _show
 
-        scene = _layouts.make(layout, spacing=spacing, dim=dim, seed=seed, fill=fill)
-        path = out or Path("out") / f"{layout}.png"
-        _commands.check_ending(path, _show.endings())
-        typer.echo(_show.draw(scene, take_file(path)))
+    scene = _layouts.make(layout, spacing=spacing, dim=dim, seed=seed, fill=fill)
+    path = out or Path("out") / f"{layout}.png"
+    _commands.check_ending(path, _show.endings())
+    typer.echo(_show.draw(scene, take_file(path)))
 
 
 @app.command(short_help="Write the points of a layout to a file.")
@@ -146,12 +140,11 @@ def export(
     counts: Annotated[bool, typer.Option("--counts", help="Store the number of neighbors of each point too.")] = False,
 ) -> None:
     """Write the points of a layout to a file, for ParaView or a spreadsheet."""
-    with usage_errors():
-        from experiments import _export, _layouts
+    from experiments import _export, _layouts
 
-        _commands.check_ending(out, _export.ENDINGS)
-        scene = _layouts.make(layout, spacing=spacing, dim=dim, seed=seed, fill=fill, dtype=dtype)
-        typer.echo(_export.write(scene, take_file(out), counts))
+    _commands.check_ending(out, _export.ENDINGS)
+    scene = _layouts.make(layout, spacing=spacing, dim=dim, seed=seed, fill=fill, dtype=dtype)
+    typer.echo(_export.write(scene, take_file(out), counts))
 
 
 def _add_group(name: str, text: str, module: str, there: dict[str, str]) -> None:

@@ -65,23 +65,28 @@ def those_of(there: dict[str, tuple[str, str]]) -> type[Commands]:
 
 
 def _make_command(function: Callable[..., Any]) -> Callable[..., None]:
-    """Return a command that prints what a function returns, and says its mistakes in a line."""
+    """Return a command that prints what a function returns."""
 
     @functools.wraps(function)
     def command(*args: Any, **options: Any) -> None:  # noqa: ANN401
-        with usage_errors(), stoppable():
+        with stoppable():
             typer.echo(function(*args, **options))
 
     return command
 
 
 def _report_error(error: Exception, given: Sequence[str]) -> int:
-    """Print a mistake in the command line and return the exit code; what else went wrong is raised again."""
+    """Print a mistake, what cannot be read or written, or too little memory, and return the exit code; raise all else again."""
     if isinstance(error, typer.Abort):
         typer.echo("aborted", err=True)
         return 1
-    if isinstance(error, UsageError):
-        typer.echo(f"error: {error}", err=True)
+    if isinstance(error, UsageError | OSError | MemoryError):
+        said = str(error)
+        if isinstance(error, OSError):
+            said = (f"{error.filename}: " if error.filename else "") + (error.strerror or said)
+        elif isinstance(error, MemoryError):
+            said = f"this takes more memory than there is; ask for fewer particles: {said}"
+        typer.echo(f"error: {said}", err=True)
         return 2
     tell, context = getattr(error, "format_message", None), getattr(error, "ctx", None)
     if tell is None:
@@ -170,29 +175,12 @@ def take_file(path: Path, option: str = "--out") -> Path:
 
 
 @contextmanager
-def usage_errors() -> Iterator[None]:
-    """Turn a UsageError, a file that cannot be read or written, or too little memory, into a line and exit code 2."""
-    try:
-        yield
-    except OSError as error:
-        where = f"{error.filename}: " if error.filename else ""
-        typer.echo(f"error: {where}{error.strerror or error}", err=True)
-        raise typer.Exit(2) from error
-    except UsageError as error:
-        typer.echo(f"error: {error}", err=True)
-        raise typer.Exit(2) from error
-    except MemoryError as error:
-        typer.echo(f"error: this takes more memory than there is; ask for fewer particles: {error}", err=True)
-        raise typer.Exit(2) from error
-
-
-@contextmanager
-def stoppable(start: str = "here") -> Iterator[None]:
-    """Where the user stops what keeps its rows, say where the same command goes on, and exit with code 130."""
+def stoppable() -> Iterator[None]:
+    """Where the user stops what keeps its rows, say that the same command goes on, and exit with code 130."""
     try:
         yield
     except KeyboardInterrupt:
-        typer.echo(f"stopped; the same command goes on from {start}", err=True)
+        typer.echo("stopped; the same command goes on from here", err=True)
         raise typer.Exit(130) from None
 
 

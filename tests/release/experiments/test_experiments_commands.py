@@ -2,12 +2,11 @@
 
 import numpy as np
 import pytest
-import typer
 from commanded import invoke, refused, told
 from places import ROOT
 from started import run_python
 
-from experiments import _commands, _config
+from experiments import _config, _layouts
 from experiments._errors import UsageError
 from experiments.bench.gpu import Config
 
@@ -183,11 +182,9 @@ def test_folders_that_hold_something_else(tmp_path):
     assert refused("merge", tmp_path, tmp_path / "none").startswith(f"{rows}: line 1 is no row")
 
 
-def test_too_little_memory_is_said_in_a_line(capsys):
-    with pytest.raises(typer.Exit) as ended, _commands.usage_errors():
-        np.empty((1 << 40, 1 << 10))
-    assert ended.value.exit_code == 2
-    assert capsys.readouterr().err.startswith("error: this takes more memory than there is; ask for fewer particles: ")
+def test_too_little_memory_is_said_in_a_line(monkeypatch):
+    monkeypatch.setattr(_layouts, "make", lambda name, **options: np.empty((1 << 40, 1 << 10)))
+    assert refused("show", "corners").startswith("this takes more memory than there is; ask for fewer particles: ")
 
 
 def test_a_mistake_ends_a_process_with_2_and_a_line():
