@@ -25,7 +25,6 @@ COLUMNS = (
 )
 SHOWN = ("method", "n", "faces", "cutoff", "pairs", "median_s", "processor_s", "us_per_particle", "missing", "extra")
 _FEW = 2_000  # points that a peer is asked for whose time would be minutes
-_CURVES: tuple[Name, ...] = ("row", "morton", "hilbert")
 Faces = Annotated[list[int], typer.Option(min=100, max=10_000_000, help="Of gears, about; may be said several times.")]
 Cutoffs = Annotated[list[float], typer.Option(callback=positive, help="[modules]; may be said several times.")]
 
@@ -57,11 +56,10 @@ def command(
     """Time the triangles of a gear that are near particles, beside trimesh and libigl where they are installed.
 
     jfrnn lists all triangles within the cutoff: "update" with the cells of a wall that stays, "rebuild" with one that is sorted
-    anew, "morton order" and the like the first for points along a curve. Beside "warp" also "bvh", the same in a tree of boxes.
-    Peers find the one nearest triangle of each point, however far, but for "wp.Mesh": "nearest" looks no farther than the cutoff,
-    "boxes" only counts triangles whose boxes are as near, which is where a search through its tree of boxes begins; both run on one
-    core of a CPU. On a GPU calls of jfrnn are not waited for one by one. `missing` and `extra` are particles of which jfrnn says
-    otherwise than a peer, in float64, whether a triangle is near.
+    anew, "count" only counts them. Beside "warp" also "bvh", the same in a tree of boxes. Peers find the one nearest triangle of
+    each point, however far, but for "wp.Mesh nearest", which looks no farther than the cutoff, on one core of a CPU. On a GPU calls
+    of jfrnn are not waited for one by one. `missing` and `extra` are particles of which jfrnn says otherwise than a peer, in
+    float64, whether a triangle is near.
     The module of gears is 1, their teeth are 20; points are random in their bounding boxes.
     """
     check_choice("--backend", backend, ("warp", "bvh", "jax"))
@@ -93,11 +91,9 @@ def _rows(scene: _Scene, cutoff: float, rounds: int, backend: Name, dtype: str, 
     for way, call in calls.items():
         _, _, processor = _repeat(lambda call=call: jax.block_until_ready(call()))
         yield common | row | {"method": f"jfrnn {way}"} | _times_of(seconds[way], n, processor)
-    for name, (asked, distance, taken, processor) in (peers | _trees(scene, cutoff)).items():
+    for name, (asked, distance, taken, processor) in (peers | _tree(scene, cutoff)).items():
         within = distance < cutoff
         wrong = {"missing": int(np.sum(within & ~near[asked])), "extra": int(np.sum(near[asked] & ~within))}
-        if len(asked) == 0:
-            asked, wrong = scene.points, {}
         package = "warp-lang" if name.startswith("wp.") else name
         row = {"n": len(asked), "method": name, "peer": str(_machine.versions([package])[package])} | wrong
         yield common | row | _times_of(taken, len(asked), processor)
@@ -112,7 +108,7 @@ def _gear(n: int, faces: int) -> _Scene:
 
 
 def _calls(scene: _Scene, cutoff: float, backend: Name, dtype: str) -> tuple[dict[str, Callable[[], Any]], jfrnn.TriangleList]:
-    """Return compiled updates of a list by name: of a wall that stays or is sorted anew, counts, and particles along curves."""
+    """Return compiled updates of a list by name: of a wall that stays or is sorted anew, and counts."""
     x, vertices = jnp.asarray(scene.points, dtype), jnp.asarray(scene.vertices, dtype)
     tri = jfrnn.search_triangles(x, vertices, jnp.asarray(scene.faces), cutoff, backend=backend)
     update = jax.jit(lambda x, tri: tri.update(x))
@@ -120,9 +116,6 @@ def _calls(scene: _Scene, cutoff: float, backend: Name, dtype: str) -> tuple[dic
     count = jax.jit(lambda x, tri: tri.update(x).count)
     calls: dict[str, Callable[[], Any]] = {"update": lambda: update(x, tri), "rebuild": lambda: rebuild(x, vertices, tri)}
     calls["count"] = lambda: count(x, tri)
-    for curve in _CURVES:
-        ordered = x[jfrnn.sort_order(x, tri.cutoff, curve=curve)]
-        calls[f"update, {curve} order"] = lambda ordered=ordered: update(ordered, tri)
     jax.block_until_ready([call() for call in calls.values()])
     return calls, tri
 
@@ -145,20 +138,16 @@ def _trimesh(scene: _Scene) -> _Asked:
     return _Asked(asked, distance, seconds, processor)
 
 
-def _trees(scene: _Scene, cutoff: float) -> dict[str, _Asked]:
+def _tree(scene: _Scene, cutoff: float) -> dict[str, _Asked]:
     """Ask the tree of boxes that Warp has of a mesh, by name of the way; empty where Warp is missing."""
     if importlib.util.find_spec("warp") is None:
         return {}
     from experiments.bench import bvh
 
-    everyone = np.arange(len(scene.points))
     device = "cpu" if jax.default_backend() == "cpu" else "cuda:0"
-    tree = bvh.Tree(scene.points, scene.vertices, scene.faces, cutoff, device)
-    found, seconds, processor = _repeat(tree.nearest)
-    return {
-        "wp.Mesh nearest": _Asked(everyone, found.numpy(), seconds, processor),
-        "wp.Mesh boxes": _Asked(everyone[:0], np.empty(0), *_repeat(tree.boxes)[1:]),
-    }
+    find = bvh.find_nearest(scene.points, scene.vertices, scene.faces, cutoff, device)
+    found, seconds, processor = _repeat(find)
+    return {"wp.Mesh nearest": _Asked(np.arange(len(scene.points)), found.numpy(), seconds, processor)}
 
 
 def _repeat(call: Callable[[], Any]) -> tuple[Any, list[float], float]:
