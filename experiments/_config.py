@@ -5,7 +5,7 @@ import itertools
 import json
 import random
 import tomllib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, get_args
@@ -29,13 +29,19 @@ class Table(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
 
 
-def _check_layout(name: str) -> str:
-    if not _layouts.is_layout(name):
-        raise ValueError(f"unknown layout {name!r}; allowed: {', '.join(_layouts.names())}")
-    return name
+def one_of(kind: str, names: Callable[[], Iterable[str]], is_one: Callable[[str], bool] | None = None) -> AfterValidator:
+    """Return what refuses a name that is none of a kind; a ValueError says which there are."""
+
+    def check(name: str) -> str:
+        if not (name in names() if is_one is None else is_one(name)):
+            raise ValueError(f"unknown {kind} {name!r}; allowed: {', '.join(names())}")
+        return name
+
+    return AfterValidator(check)
 
 
-LayoutName = Annotated[str, AfterValidator(_check_layout)]
+MethodName = Annotated[str, one_of("method", methods.names)]
+LayoutName = Annotated[str, one_of("layout", _layouts.names, _layouts.is_layout)]
 
 
 class Scenes(Table):
@@ -69,12 +75,6 @@ class Scenes(Table):
             yield dict(zip(axes, values, strict=True))
 
 
-def _check_method(name: str) -> str:
-    if name not in methods.names():
-        raise ValueError(f"unknown method {name!r}; allowed: {', '.join(methods.names())}")
-    return name
-
-
 class Repeats(Table):
     """How often something is timed."""
 
@@ -98,7 +98,7 @@ class Repeats(Table):
 class Config(Repeats):
     """A sweep: scenes × methods, and how each row is measured."""
 
-    methods: tuple[Annotated[str, AfterValidator(_check_method)], ...] = Field(min_length=1)
+    methods: tuple[MethodName, ...] = Field(min_length=1)
     """What is compared: `python -m experiments list` names all; a file of experiments/methods each."""
     scenes: tuple[Scenes, ...] = Field(min_length=1)
     """Tables [[scenes]], one after another."""

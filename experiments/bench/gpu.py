@@ -15,12 +15,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import typer
-from pydantic import AfterValidator, NonNegativeInt, PositiveInt
+from pydantic import NonNegativeInt, PositiveInt
 
 import jfrnn
 from experiments import _machine, _measure
 from experiments._commands import take_folder
-from experiments._config import Dtype, Positive, Table, load
+from experiments._config import Dtype, Positive, Table, load, one_of
 from experiments._library import load_warp, round_capacity
 from experiments.bench import decisions, lists, table, ways
 
@@ -49,7 +49,7 @@ class Config(Table):
     sizes: tuple[PositiveInt, ...] = ()
     calls: PositiveInt = 200
     steps: PositiveInt = 100
-    sums: tuple[Annotated[str, AfterValidator(ways.check_way)], ...] = ()  # of a density and its gradient
+    sums: tuple[Annotated[str, one_of("way", lambda: ways.WAYS)], ...] = ()  # of a density and its gradient
     repeats: PositiveInt = 5
     seconds_per_timing: Positive = 1.0
 

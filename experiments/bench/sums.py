@@ -11,15 +11,15 @@ import pandas as pd
 import typer
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from pydantic import AfterValidator, Field
+from pydantic import Field
 
 from experiments import _sweep
 from experiments._commands import RetryFailed, RowsFolder, take_folder
-from experiments._config import Dtype, LayoutName, Positive, Repeats, digest, load
+from experiments._config import Dtype, LayoutName, Positive, Repeats, digest, load, one_of
 from experiments._look import MARKERS, OURS, PEERS_COLORS, WIDTH, dress, factor, head, plain, write_names
 from experiments._loop import Shown, Task, fill
 from experiments._rows import RowFile
-from experiments.bench.ways import WAYS, check_way
+from experiments.bench.ways import WAYS
 
 ERROR_UNIT = "eps·√neighbors"
 """The unit of errors of sums: what rounding makes of a sum of so many terms, in machine epsilons."""
@@ -35,7 +35,7 @@ _Line = dict[str, Any]
 class Config(Repeats):
     """Scenes × ways, and how each row is measured."""
 
-    ways: tuple[Annotated[str, AfterValidator(check_way)], ...] = Field(min_length=1)  # of `ways.WAYS`
+    ways: tuple[Annotated[str, one_of("way", lambda: WAYS)], ...] = Field(min_length=1)  # of `ways.WAYS`
     layouts: tuple[LayoutName, ...] = Field(min_length=1)  # of full domains
     spacings: tuple[Positive, ...] = Field(min_length=1)  # distances of lattice neighbors [m], each a number of particles
     gradients: tuple[bool, ...] = (False, True)  # whether the gradient is asked for, too

@@ -292,10 +292,3 @@ WAYS = {
     "scipy pairs alone": Way(_scipy, "scipy", sums=False),
     "flat list, pair_sum": Way(_pair_sum_over(_our_flat_list), compensates=True),
 }
-
-
-def check_way(name: str) -> str:
-    """Return the name of a way; a ValueError says which there are."""
-    if name not in WAYS:
-        raise ValueError(f"unknown way {name!r}; allowed: {', '.join(WAYS)}")
-    return name
