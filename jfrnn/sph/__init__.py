@@ -15,58 +15,11 @@ from jfrnn.sph.probes import flow_through, force_on_solid, force_on_walls, press
 from jfrnn.sph.relaxing import relax
 from jfrnn.sph.runs import How, run
 from jfrnn.sph.settings import make_scene
-from jfrnn.sph.solver import (
-    advance,
-    advance_until,
-    begin,
-    courant,
-    density_and_pressure,
-    energies,
-    list_neighbors,
-    rollout,
-    step,
-)
+from jfrnn.sph.solver import advance, advance_until, begin, courant, density_and_pressure, energies, list_neighbors, rollout, step
 from jfrnn.sph.toml_scenes import read_scene
 
-__all__ = [
-    "DivergedError",
-    "FluidScene",
-    "Gas",
-    "GasScene",
-    "How",
-    "Model",
-    "Periodic",
-    "Physics",
-    "Scene",
-    "SceneError",
-    "Solid",
-    "State",
-    "Tank",
-    "Turning",
-    "advance",
-    "advance_until",
-    "begin",
-    "check_scene",
-    "courant",
-    "density_and_pressure",
-    "energies",
-    "flow_through",
-    "force_on_solid",
-    "force_on_walls",
-    "inflow",
-    "lattice",
-    "list_neighbors",
-    "make_model",
-    "make_scene",
-    "make_state",
-    "pressure_at",
-    "read_scene",
-    "read_solid",
-    "relax",
-    "rollout",
-    "run",
-    "step",
-    "surface_height",
-    "with_particles",
-    "with_solid",
-]
+__all__ = ["FluidScene", "Gas", "GasScene", "Periodic", "Physics", "Scene", "Solid", "Tank", "Turning", "inflow", "lattice"]
+__all__ += ["SceneError", "check_scene", "make_scene", "read_scene", "read_solid", "relax", "with_particles", "with_solid"]
+__all__ += ["DivergedError", "How", "Model", "State", "list_neighbors", "make_model", "make_state", "run"]
+__all__ += ["advance", "advance_until", "begin", "courant", "density_and_pressure", "energies", "rollout", "step"]
+__all__ += ["flow_through", "force_on_solid", "force_on_walls", "pressure_at", "surface_height"]

@@ -72,12 +72,7 @@ def faster_way(platform: str, particles: int) -> str:
 
 
 def run(
-    scene: Scene,
-    folder: Path | str,
-    how: How = How(),
-    *,
-    force: Force | None = None,
-    probes: dict[str, Probe] | None = None,
+    scene: Scene, folder: Path | str, how: How = How(), *, force: Force | None = None, probes: dict[str, Probe] | None = None
 ) -> State:
     """Run a scene from its beginning, or from the last snapshot of the folder, to its end.
 
