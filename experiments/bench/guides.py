@@ -1,6 +1,5 @@
 """What a reader of a guide waits for: its code in a fresh process, with and without compiled kernels, and what is compiled."""
 
-import tempfile
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
@@ -30,16 +29,5 @@ def command(out: Annotated[Path, typer.Option(help="Folder of the table, one fil
 
 
 def _rows(page: Path) -> Iterator[table.Line]:
-    with tempfile.TemporaryDirectory() as name:
-        packages, kernels = Path(name) / "packages", Path(name) / "kernels"
-        kernels.mkdir()
-        start.link(start.ROOT, packages)
-        for cache in ("cold", "warm"):
-            row = start.run(str(page), packages, kernels, _FOUR if page.stem == "many-devices" else {})
-            row |= {
-                "guide": page.stem,
-                "cache": cache,
-                "kernels": sum(1 for _ in kernels.rglob("*.o")),
-                **_machine.commit(start.ROOT),
-            }
-            yield row
+    more = _FOUR if page.stem == "many-devices" else {}
+    yield from ({"guide": page.stem} | row for row in start.run_twice(str(page), start.ROOT, more))

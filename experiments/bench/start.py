@@ -57,14 +57,20 @@ def command(
 
 
 def _rows(what: str, who: str, checkout: Path, repeat: int) -> Iterator[table.Line]:
-    """Yield the rows of two processes: of the first, and of the next, which finds the kernels of the first."""
+    for row in run_twice(what, checkout):
+        waited = {"wait_s": row["import_jfrnn_s"] + row["first_s"]} if row["status"] == "ok" else {}
+        yield {"who": who, "what": what, "repeat": repeat} | row | waited
+
+
+def run_twice(asked: str, checkout: Path, more: dict[str, str] | None = None) -> Iterator[table.Line]:
+    """Yield the rows of two processes, see `run`: of the first, and of the next, which finds the kernels of the first."""
     with tempfile.TemporaryDirectory() as name:
         packages, kernels = Path(name) / "packages", Path(name) / "kernels"
         kernels.mkdir()
         link(checkout, packages)
         for cache in ("cold", "warm"):
-            row = {"who": who, "what": what, "cache": cache, "repeat": repeat, **_machine.commit(checkout)}
-            yield row | measure_process(what, packages, kernels)
+            row = run(asked, packages, kernels, more) | {"cache": cache, **_machine.commit(checkout)}
+            yield row | {"kernels": sum(1 for _ in kernels.rglob("*.o"))}
 
 
 def link(checkout: Path, packages: Path) -> None:
@@ -75,12 +81,6 @@ def link(checkout: Path, packages: Path) -> None:
         (packages / "jfrnn" / name).symlink_to(part)
     for name in ("jfrnn", "kernels", "cases"):  # as an installation does: no process waits for bytecode
         compileall.compile_dir(checkout / name, quiet=2)
-
-
-def measure_process(what: str, packages: Path, kernels: Path) -> table.Line:
-    """Return the columns of a process up to its first results, `search` or `gradient`."""
-    row = run(what, packages, kernels)
-    return row | {"wait_s": row["import_jfrnn_s"] + row["first_s"]} if row["status"] == "ok" else row
 
 
 def run(asked: str, packages: Path, kernels: Path, more: dict[str, str] | None = None) -> table.Line:

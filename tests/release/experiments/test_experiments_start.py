@@ -24,7 +24,7 @@ def test_rows_of_fresh_processes(monkeypatch, tmp_path, what):
 
 def test_a_process_that_fails_says_why(tmp_path):
     start.link(start.ROOT, tmp_path / "packages")
-    row = start.measure_process("nothing", tmp_path / "packages", tmp_path)
+    row = start.run("nothing", tmp_path / "packages", tmp_path)
     assert row["status"] == "failed"
     assert row["reason"].endswith("KeyError: 'nothing'")
 
