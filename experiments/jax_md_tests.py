@@ -21,11 +21,14 @@ import sys
 import tempfile
 import time
 import urllib.request
+from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from experiments import _machine
 
 FILES = ("partition_test.py", "custom_partition_test.py", "energy_test.py", "smap_test.py", "simulate_test.py", "nn_test.py")
 UNITS = ("berendsen", "csvr", "npt_melting", "npt", "nve", "nvk", "nvt", "velocity_rescale")
@@ -91,13 +94,17 @@ def pytest_runtest_logreport(report: Any) -> None:  # noqa: ANN401
         return
     if report.when == "teardown":
         return
-    theirs, ours = os.environ[_COMMITS].split()
     told = str(report.longrepr[-1] if isinstance(report.longrepr, tuple) else report.longrepr or "").strip()
     row = (report.nodeid.partition("::")[0].rpartition("/")[2], _name(report.nodeid), _who())
     outcome = judge(told) if report.outcome == "failed" else report.outcome
-    reason = [told.splitlines()[-1][:200] if told else ""]
-    with Path(os.environ[_ROWS]).open("a", newline="") as file:
-        csv.writer(file).writerow((*row, outcome, f"{report.duration:.1f}", *reason, theirs, version("jax"), ours))
+    _add_row(row, outcome, report.duration, told.splitlines(), os.environ)
+
+
+def _add_row(key: tuple[str, ...], outcome: str, seconds: float, lines: list[str], environment: Mapping[str, str]) -> None:
+    """Add the row of a test or of an example; the last of the lines is its reason."""
+    theirs, ours = environment[_COMMITS].split()
+    with Path(environment[_ROWS]).open("a", newline="") as file:
+        csv.writer(file).writerow((*key, outcome, f"{seconds:.1f}", (lines or [""])[-1][:200], theirs, version("jax"), ours))
 
 
 def judge(told: str) -> str:
@@ -127,12 +134,12 @@ def run(checkout: Path, file: str, ours: bool, options: list[str], out: Path) ->
     if not out.exists():
         out.write_text(",".join(COLUMNS) + "\n")
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(checkout), str(ROOT), os.environ.get("PYTHONPATH", "")])}
-    commits = [commit_of(folder) for folder in (checkout, ROOT)]
+    commits = [(_machine.commit(folder)["commit"] or "unknown")[:12] for folder in (checkout, ROOT)]
     environment |= {_ROWS: str(out), _COMMITS: " ".join(commits), "READTHEDOCS": "True", "MPLBACKEND": "agg"}
     environment |= {_OURS: "1"} if ours else {}
     if file in EXAMPLES:
         if (file, "", LISTS[ours]) not in read(out):
-            _run_example(checkout / file, (file, "", LISTS[ours]), environment, out)
+            _run_example(checkout / file, (file, "", LISTS[ours]), environment)
         return
     command = [sys.executable, "-m", "pytest", "-q", "--no-header", "-p", "experiments.jax_md_tests", "-c", os.devnull]
     command += ["--rootdir", str(checkout), *options, str(checkout / "tests" / file)]
@@ -141,7 +148,7 @@ def run(checkout: Path, file: str, ours: bool, options: list[str], out: Path) ->
         raise SystemExit(f"no test ran: {(done.stdout + done.stderr).strip()[-2000:]}")
 
 
-def _run_example(path: Path, key: tuple[str, ...], environment: dict[str, str], out: Path) -> None:
+def _run_example(path: Path, key: tuple[str, ...], environment: dict[str, str]) -> None:
     """Run an example in an empty folder, and add its row: the reason is the last line that it printed."""
     began = time.monotonic()
     with tempfile.TemporaryDirectory() as folder:
@@ -150,16 +157,7 @@ def _run_example(path: Path, key: tuple[str, ...], environment: dict[str, str], 
     outcome = judge(done.stderr) if done.returncode else "passed"
     lines = (done.stderr if done.returncode else done.stdout).strip().splitlines()
     numbers = [line for line in lines if re.search(r"\d\.\d", line)] if not done.returncode else lines
-    theirs, ours = environment[_COMMITS].split()
-    row = (*key, outcome, f"{time.monotonic() - began:.1f}", (numbers or [""])[-1][:200], theirs, version("jax"), ours)
-    with out.open("a", newline="") as file:
-        csv.writer(file).writerow(row)
-
-
-def commit_of(folder: Path) -> str:
-    """Return the commit of a checkout, in twelve letters."""
-    told = subprocess.run(["git", "rev-parse", "--short=12", "HEAD"], cwd=folder, capture_output=True, text=True, check=False)
-    return told.stdout.strip() or "unknown"
+    _add_row(key, outcome, time.monotonic() - began, numbers, environment)
 
 
 def passed_by(rows: Rows, file: str, who: str) -> set[str]:

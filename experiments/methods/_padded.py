@@ -1,6 +1,7 @@
 """The library's padded full list, compiled once for the capacity that the scene needs."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -27,6 +28,16 @@ def compile_for(function: Callable[..., Any], positions: np.ndarray, *more: jax.
     if kernels:
         jax.block_until_ready(jitted(*(jnp.asarray(values)[:1] for values in (x, *more))))
     return lambda: jax.block_until_ready(compiled(jnp.asarray(x), *more))
+
+
+def compile_update(lists: tuple[Any, np.ndarray], positions: Any, cutoff: float) -> Callable[[Any], Any]:  # noqa: ANN401
+    """Return a compiled update of a list of jax-md or jax-sph, with its lowest coordinates: from positions to pairs, made anew."""
+    nbrs, low = lists
+    moved = replace(nbrs, reference_position=nbrs.reference_position + 2 * cutoff)  # else it keeps what it has
+    update = jax.jit(lambda x, nbrs: nbrs.update(x - low))
+    if update(jnp.asarray(positions), moved).did_buffer_overflow:
+        raise RuntimeError("the list overflowed right after it was allocated")
+    return lambda x: update(x, moved).idx
 
 
 def of_backend(backend: Name, kernels: bool = False) -> tuple[Callable[..., Any], Callable[..., Any], Callable[..., Any]]:

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from experiments.methods import Found
 
@@ -10,6 +11,11 @@ from experiments.methods import Found
 def in_space(positions: np.ndarray) -> np.ndarray:
     """Return points in space: what lies in a plane has z = 0."""
     return np.pad(positions, ((0, 0), (0, 3 - positions.shape[1])))
+
+
+def most_in_ball(positions: np.ndarray, cutoff: float) -> int:
+    """Return the most particles within the cutoff of one, itself included."""
+    return int(KDTree(positions).query_ball_point(positions, cutoff, return_length=True, workers=-1).max())
 
 
 def prepare_matscipy(

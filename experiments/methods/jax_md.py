@@ -1,7 +1,6 @@
 """jax-md: cells of fixed capacity and a padded list, jitted; its `update` is timed, made to rebuild."""
 
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
 import jax
@@ -9,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax_md import partition, space  # pyright: ignore[reportMissingImports]
 
-from experiments.methods import Found, at_hand
+from experiments.methods import Found, _padded, at_hand
 
 PACKAGES = ("jax-md",)
 MAX_POINTS = 130_000  # 19 GB at 250 000
@@ -30,12 +29,7 @@ def allocate(positions: np.ndarray, cutoff: float, sparse: bool = False) -> tupl
 
 def compile_update(positions: Any, cutoff: float, lists: Any = None) -> Callable[[Any], jax.Array]:  # noqa: ANN401
     """Return a compiled update of a list, from positions to the list, which is not waited for."""
-    nbrs, low = lists or allocate(positions, cutoff)
-    moved = replace(nbrs, reference_position=nbrs.reference_position + 2 * cutoff)  # else it keeps what it has
-    update = jax.jit(lambda x, nbrs: nbrs.update(x - low))
-    if update(jnp.asarray(positions), moved).did_buffer_overflow:
-        raise RuntimeError("the list overflowed right after it was allocated")
-    return lambda x: update(x, moved).idx
+    return _padded.compile_update(lists or allocate(positions, cutoff), positions, cutoff)
 
 
 def prepare(positions: np.ndarray, cutoff: float, lists: Any) -> Callable[[], jax.Array]:  # noqa: ANN401

@@ -1,7 +1,6 @@
 """jax-sph's own list `jaxmd_scan`, jitted: jax-md's cells, walked in parts to save memory. Toshev et al., arXiv:2403.04750."""
 
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
 import jax
@@ -11,6 +10,7 @@ from jax_sph.jax_md import space  # pyright: ignore[reportMissingImports]
 from jax_sph.partition import neighbor_list  # pyright: ignore[reportMissingImports]
 
 from experiments.methods import Found, at_hand
+from experiments.methods._padded import compile_update
 
 PACKAGES = ("jax-sph",)
 MAX_POINTS = 130_000
@@ -28,13 +28,8 @@ def allocate(positions: np.ndarray, cutoff: float) -> Any:  # noqa: ANN401
 
 def prepare(positions: np.ndarray, cutoff: float, lists: Any) -> Callable[[], tuple[jax.Array, int]]:  # noqa: ANN401
     """Compile the update, and return it: its edges, and the number that unused ones lead from and to."""
-    nbrs, low = lists
-    moved = replace(nbrs, reference_position=nbrs.reference_position + 2 * cutoff)  # else it keeps what it has
-    update = jax.jit(lambda x, nbrs: nbrs.update(x - low))
-    if update(jnp.asarray(positions), moved).did_buffer_overflow:
-        raise RuntimeError("the list overflowed right after it was allocated")
-    x = at_hand(positions)
-    return lambda: (jax.block_until_ready(update(jnp.asarray(x), moved).idx), len(positions))
+    update, x = compile_update(lists, positions, cutoff), at_hand(positions)
+    return lambda: (jax.block_until_ready(update(jnp.asarray(x))), len(positions))
 
 
 def read(result: tuple[jax.Array, int]) -> Found:

@@ -11,15 +11,9 @@ from nvalchemiops.jax.neighbors.naive import naive_neighbor_list  # pyright: ign
 
 from experiments.methods import Found, at_hand
 from experiments.methods._padded import found_in_rows
+from experiments.methods._pairs import most_in_ball as allocate  # without it, the list is cut off in silence
 
 PACKAGES = ("nvalchemi-toolkit-ops",)
-
-
-def allocate(positions: np.ndarray, cutoff: float) -> int:
-    """Return the most neighbors of a particle; without it, the list is cut off in silence."""
-    from scipy.spatial import KDTree
-
-    return int(KDTree(positions).query_ball_point(positions, cutoff, return_length=True, workers=-1).max())
 
 
 def compile_search(positions: Any, cutoff: float, capacity: int) -> Callable[[Any], tuple[jax.Array, jax.Array]]:  # noqa: ANN401

@@ -6,15 +6,9 @@ import numpy as np
 from pykdtree.kdtree import KDTree  # pyright: ignore[reportMissingImports]
 
 from experiments.methods import Found
+from experiments.methods._pairs import most_in_ball as allocate  # it cannot ask for all within a distance
 
 PACKAGES = ("pykdtree",)
-
-
-def allocate(positions: np.ndarray, cutoff: float) -> int:
-    """Return the most neighbors of a particle, itself included; it cannot ask for all within a distance."""
-    from scipy.spatial import KDTree as Counter
-
-    return int(Counter(positions).query_ball_point(positions, cutoff, return_length=True).max())
 
 
 def prepare(positions: np.ndarray, cutoff: float, capacity: int) -> Callable[[], np.ndarray]:

@@ -190,7 +190,7 @@ def _jax_sph() -> Row:
     from omegaconf import OmegaConf  # pyright: ignore[reportMissingImports]
 
     import jfrnn
-    from experiments.jax_md_tests import commit_of
+    from experiments import _machine
 
     along, times, seen = round(WATER ** (1 / 3)), [], {}
 
@@ -212,7 +212,7 @@ def _jax_sph() -> Row:
     box = jfrnn.Box([1.0] * 3)
     met = np.asarray(jfrnn.count(seen["x"], 3.0 / along, box=box)).mean()
     return {
-        "version": commit_of(Path(simulate.__file__).parents[1])[:7],
+        "version": (_machine.commit(Path(simulate.__file__).parents[1])["commit"] or "unknown")[:7],
         "device": jax.devices()[0].device_kind,
         "fluid": along**3,
         "walls": 0,
