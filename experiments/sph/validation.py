@@ -167,12 +167,13 @@ def reverse_poiseuille(scene: FluidScene, seen: list[Seen]) -> tuple[list[Figure
         errors.append(relative(at.v, np.stack([known, 0 * known], axis=1)))
         curves[f"t = {at.time:.2g} s, measured"] = means(at.x[:, 1] % 1, at.v[:, 0], np.linspace(0, 1, 41))
         curves[f"t = {at.time:.2g} s, known"] = curve(y, exact(y, at.time))
-    target = 0.02 if scene.spacing > 1 / 40 else 0.01
-    figures = [
-        Figure(f"velocity, relative L2, t = {seen[-1].time:.2g}", errors[-1], None, target),
-        Figure("velocity, relative L2, largest of all times", max(errors), None, target),
-    ]
-    return figures, curves
+    return _of_profiles(seen, errors, 0.02 if scene.spacing > 1 / 40 else 0.01), curves
+
+
+def _of_profiles(seen: list[Seen], errors: list[float], target: float) -> list[Figure]:
+    """Return what is said of profiles, each of which has an error."""
+    measured = {f"t = {seen[-1].time:.2g}": errors[-1], "largest of all times": max(errors)}
+    return [Figure(f"velocity, relative L2, {when}", error, None, target) for when, error in measured.items()]
 
 
 def rotor(scene: FluidScene, seen: list[Seen]) -> tuple[list[Figure], Curves]:
@@ -196,16 +197,11 @@ def channel(scene: FluidScene, seen: list[Seen]) -> tuple[list[Figure], Curves]:
     """Profiles between plates."""
     exact = {"poiseuille": answers.poiseuille, "couette": answers.couette}[scene.name]
     errors = [relative(at.v[:, 0], exact(at.x[:, 1], at.time)) for at in seen]
-    curves, edges = {}, np.linspace(0, 1, 31)
+    curves, edges, y = {}, np.linspace(0, 1, 31), np.linspace(0, 1, 61)
     for at in seen:
-        y = np.linspace(0, 1, 61)
         curves[f"t = {at.time:.2g} s, measured"] = means(at.x[:, 1], at.v[:, 0], edges)
         curves[f"t = {at.time:.2g} s, known"] = curve(y, exact(y, at.time))
-    figures = [
-        Figure(f"velocity, relative L2, t = {seen[-1].time:.2g}", errors[-1], None, 0.007),
-        Figure("velocity, relative L2, largest of all times", max(errors), None, 0.007),
-    ]
-    return figures, curves
+    return _of_profiles(seen, errors, 0.007), curves
 
 
 def cavity(scene: FluidScene, seen: list[Seen]) -> tuple[list[Figure], Curves]:

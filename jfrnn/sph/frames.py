@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
 from matplotlib.colors import Normalize
@@ -21,45 +22,40 @@ def draw(scene: Scene, there: np.ndarray, x: np.ndarray, v: np.ndarray, time: fl
     `there` says which particles take part, shape [n], bool, of positions x [m] and velocities v [m/s], shape [n, d], at a time [s].
     The frame is the bounds of the scene, and the color scale ends at `top_speed` [m/s].
     """
-    if scene.solid is not None and scene.dim == 3:
-        _draw_in_space(scene, x[there], v[there], time, top_speed, path)
-        return
+    aslant = scene.solid is not None and scene.dim == 3
     lower, upper = picture_bounds(scene)
     wide, high = (upper - lower)[[0, -1]]
-    figure = Figure(figsize=(7.0, min(max(7.0 * high / wide, 2.5) + 0.8, 9.0)), layout="constrained")
-    axes = figure.add_subplot()
+    figure = Figure(figsize=(7.0, 6.0 if aslant else min(max(7.0 * high / wide, 2.5) + 0.8, 9.0)), layout="constrained")
+    axes, scale = figure.add_subplot(), ScalarMappable(Normalize(0, top_speed or 1.0), "viridis")
+    if aslant:
+        axes.imshow(view.render(scene, x[there], scale.to_rgba(np.linalg.norm(v[there], axis=1))[:, :3], time))
+        axes.set_axis_off()
+    else:
+        _draw_from_side(axes, scene, there, x, v, time, scale)
+        margin = 2 * scene.spacing
+        axes.set(xlim=(lower[0] - margin, upper[0] + margin), ylim=(lower[-1] - margin, upper[-1] + margin), aspect="equal")
+    axes.set_title(f"{scene.name}, t = {time:.4g} s")
+    figure.colorbar(scale, ax=axes, label="speed [m/s]", shrink=0.8)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=100)
+
+
+def _draw_from_side(
+    axes: Axes, scene: Scene, there: np.ndarray, x: np.ndarray, v: np.ndarray, time: float, scale: ScalarMappable
+) -> None:
     x = wrap_positions(scene, x)
     wall = np.zeros(scene.n, bool) if scene.wall is None else scene.wall
     depth = np.argsort(x[:, 1]) if scene.dim == 3 else np.arange(scene.n)
     seen = depth[(there & ~wall)[depth]]
-    pixels = 72 * 6.0 * scene.spacing / max(wide, 1e-300)
+    lower, upper = picture_bounds(scene)
+    pixels = 72 * 6.0 * scene.spacing / max(upper[0] - lower[0], 1e-300)
     shape = {"s": max(0.8 * pixels, 0.6) ** 2, "linewidths": 0}
     axes.scatter(*x[wall][:, [0, -1]].T, color=WALL, **shape)
     if scene.solid is not None:
         vertices = view.turn_vertices(scene.solid.vertices, scene.solid.turning, time)
         axes.add_collection(LineCollection(list(vertices[scene.solid.faces])))
-    speed = np.linalg.norm(v[seen], axis=1)
-    marks = axes.scatter(*x[seen][:, [0, -1]].T, c=speed, cmap="viridis", vmin=0, vmax=top_speed or 1.0, **shape)
-    figure.colorbar(marks, ax=axes, label="speed [m/s]", shrink=0.8)
-    margin = 2 * scene.spacing
-    axes.set(xlim=(lower[0] - margin, upper[0] + margin), ylim=(lower[-1] - margin, upper[-1] + margin), aspect="equal")
-    axes.set(xlabel="x [m]", ylabel=f"{'xyz'[scene.dim - 1]} [m]", title=f"{scene.name}, t = {time:.4g} s")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=100)
-
-
-def _draw_in_space(scene: Scene, x: np.ndarray, v: np.ndarray, time: float, top_speed: float, path: Path) -> None:
-    """Draw particles that have come, and the solid, aslant from above."""
-    scale = ScalarMappable(Normalize(0, top_speed or 1.0), "viridis")
-    picture = view.render(scene, x, scale.to_rgba(np.linalg.norm(v, axis=1))[:, :3], time)
-    figure = Figure(figsize=(7.0, 6.0), layout="constrained")
-    axes = figure.add_subplot()
-    axes.imshow(picture)
-    axes.set_axis_off()
-    axes.set_title(f"{scene.name}, t = {time:.4g} s")
-    figure.colorbar(scale, ax=axes, label="speed [m/s]", shrink=0.8)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=100)
+    axes.scatter(*x[seen][:, [0, -1]].T, color=scale.to_rgba(np.linalg.norm(v[seen], axis=1)), **shape)
+    axes.set(xlabel="x [m]", ylabel=f"{'xyz'[scene.dim - 1]} [m]")
 
 
 def picture_bounds(scene: Scene) -> tuple[np.ndarray, np.ndarray]:

@@ -156,9 +156,8 @@ def add_to_series(path: Path, time: float, step: int) -> None:
     """Add STEP.vtp to a series that ParaView opens; those of this step and later are removed before."""
     kept = []
     if path.exists():
-        lines = re.findall(r'^<DataSet .*file="snapshots/(\d+)\.vtp"/>$', path.read_text(), re.MULTILINE)
-        whole = re.findall(r"^<DataSet .*$", path.read_text(), re.MULTILINE)
-        kept = [line for number, line in zip(lines, whole, strict=True) if int(number) < step]
+        lines = re.findall(r'^(<DataSet .*file="snapshots/(\d+)\.vtp"/>)$', path.read_text(), re.MULTILINE)
+        kept = [line for line, number in lines if int(number) < step]
     kept.append(f'<DataSet timestep="{time:.12g}" file="snapshots/{step:09d}.vtp"/>')
     part = path.with_suffix(".part")
     text = "\n".join(['<VTKFile type="Collection" version="0.1">', "<Collection>", *kept, "</Collection>", "</VTKFile>", ""])
