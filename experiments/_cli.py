@@ -1,5 +1,6 @@
 """The command line: sweeps, scenes, and groups of commands that are imported when they are asked for."""
 
+import textwrap
 from pathlib import Path
 from typing import Annotated
 
@@ -95,8 +96,6 @@ def merge(
 @app.command(name="list", short_help="Say what layouts, methods and configs there are.")
 def list_names() -> None:
     """Print the names of layouts, methods and configs; `python -m jfrnn.sph list` prints those of fluid scenes."""
-    import textwrap
-
     from experiments import _layouts, methods
 
     absent = [name for name in methods.names() if methods.lacks(name)]

@@ -1,20 +1,19 @@
 """Points of a layout as a file: .csv for spreadsheets, .vtp and .vtk for ParaView."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
 
-if TYPE_CHECKING:
-    from cases import Scene
+from cases import Scene
+from experiments import _oracle
 
 ENDINGS = (".csv", ".vtp", ".vtk")
 NEIGHBORS = "neighbors"
 DIGITS = {np.dtype(np.float32): 9, np.dtype(np.float64): 17}  # enough to read the same float back
 
 
-def write(scene: "Scene", path: Path, counts: bool = False) -> Path:
+def write(scene: Scene, path: Path, counts: bool = False) -> Path:
     """Write the points of a scene to a file whose ending names the format, and with `counts` the neighbors of each, exactly.
 
     Coordinates are written such that they read back as the same floats. In .vtp and .vtk, 2D points get z = 0, each point is a
@@ -22,20 +21,18 @@ def write(scene: "Scene", path: Path, counts: bool = False) -> Path:
     """
     neighbors = None
     if counts:
-        from experiments import _oracle
-
         neighbors = _oracle.count_neighbors(_oracle.find_pairs(scene.positions, scene.cutoff), scene.n)
     (_write_csv if path.suffix == ".csv" else _write_vtk)(scene, path, neighbors)
     return path
 
 
-def _write_csv(scene: "Scene", path: Path, neighbors: np.ndarray | None) -> None:
+def _write_csv(scene: Scene, path: Path, neighbors: np.ndarray | None) -> None:
     frame = pd.DataFrame(scene.positions, columns=list("xyz"[: scene.dim]))
     frame = frame if neighbors is None else frame.assign(**{NEIGHBORS: neighbors})
     frame.to_csv(path, index=False, float_format=f"%.{DIGITS[scene.positions.dtype]}g")
 
 
-def _write_vtk(scene: "Scene", path: Path, neighbors: np.ndarray | None) -> None:
+def _write_vtk(scene: Scene, path: Path, neighbors: np.ndarray | None) -> None:
     import pyvista
 
     cloud = pyvista.PolyData(np.pad(scene.positions, ((0, 0), (0, 3 - scene.dim))))

@@ -5,32 +5,27 @@
 
 import re
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import numpy as np
+
+import cases
+from cases import Scene
 from experiments._errors import UsageError
-
-if TYPE_CHECKING:
-    from cases import Scene
 
 
 def names() -> list[str]:
     """Return what a layout may be called; the N of `clustersN` and the like stands for any number of tiles per axis."""
-    import cases
-
     return [*(name for name in cases.LAYOUTS if not name.startswith("clusters")), *(f"{family}N" for family in cases.FAMILIES)]
 
 
 def is_layout(name: str) -> bool:
     """Whether a scene of this name can be made."""
-    import cases
-
     return bool(re.fullmatch(rf"({'|'.join(cases.FAMILIES)})[1-9]\d*", name)) or name in cases.LAYOUTS
 
 
-def make(name: str, **options: Any) -> "Scene":  # noqa: ANN401 - those of `cases.scene`
+def make(name: str, **options: Any) -> Scene:  # noqa: ANN401 - those of `cases.scene`
     """Return a scene of `jfrnn.cases`; refuse a layout that there is not, or that cannot be made with these options."""
-    import cases
-
     if not is_layout(name):
         raise UsageError(f"unknown layout {name!r}; allowed: {', '.join(names())}")
     try:
@@ -39,16 +34,12 @@ def make(name: str, **options: Any) -> "Scene":  # noqa: ANN401 - those of `case
         raise UsageError(f"layout {name!r}: {error}") from error
 
 
-def order_scene(scene: "Scene", order: str, seed: int) -> "Scene":
+def order_scene(scene: Scene, order: str, seed: int) -> Scene:
     """Return the scene with its particles as the layout has them, "shuffled", or "sorted" by cells of a cutoff, x slowest."""
-    import cases
-
     if order == "shuffled":
         return cases.shuffle(scene, seed)
     if order == "layout":
         return scene
-    import numpy as np  # not before it is needed: the command line imports this module
-
     cells = np.floor(scene.positions.astype(np.float64) / scene.cutoff)
     place = np.lexsort(cells.T[::-1])
     return replace(scene, positions=scene.positions[place], exact=None)

@@ -8,6 +8,8 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+import psutil
+
 PACKAGES = ("jfrnn", "numpy", "scipy", "jax", "jaxlib", "warp-lang")
 
 
@@ -24,8 +26,6 @@ def versions(more: Iterable[str] = ()) -> dict[str, str | None]:
 
 def machine() -> dict[str, Any]:
     """Return processor, usable cores, memory [bytes] and operating system; no names of hosts or users."""
-    import psutil
-
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     system = f"{platform.system()} {platform.release()}"
     return {"cpu": _processor(), "cores": cores, "memory_bytes": psutil.virtual_memory().total, "system": system}

@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from experiments import _table, methods
+from experiments import _plots, _statistics, _table, methods
 from experiments._errors import UsageError
 from experiments._rows import RowFile, SearchRow, read_latest, read_text
 
@@ -50,8 +50,6 @@ def report_sweep(folder: Path) -> None:
     rows = read_latest(folder)
     if not rows:
         raise UsageError(f"{folder}: no rows; fill it with `python -m experiments run CONFIG.toml --out {folder}`")
-    from experiments import _plots, _statistics
-
     lines = _table.lines(rows)
     pictures = _plots.draw_all(_statistics.summarize(rows), folder, describe_origin(rows))
     pd.DataFrame(lines, columns=[*_table.COLUMNS], dtype=object).to_csv(folder / "table.csv", index=False, lineterminator="\r\n")

@@ -1,7 +1,6 @@
 """Pictures of a layout."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -12,10 +11,8 @@ from matplotlib.patches import Circle, Rectangle
 from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d.axes3d import Axes3D
 
+from cases import Scene
 from experiments import _table
-
-if TYPE_CHECKING:
-    from cases import Scene
 
 MILLI = 1e3
 COLOR = "#0072B2"
@@ -27,7 +24,7 @@ def endings() -> list[str]:
     return sorted(f".{ending}" for ending in Figure().canvas.get_supported_filetypes())
 
 
-def draw(scene: "Scene", path: Path) -> Path:
+def draw(scene: Scene, path: Path) -> Path:
     """Draw a scene from above, or in 3D with a slice through its fullest layer, lengths in mm, and return the path."""
     points = scene.positions.astype(np.float64) * MILLI
     flat = scene.dim == 2
@@ -53,7 +50,7 @@ def fullest_layer(heights: np.ndarray, thickness: float) -> tuple[np.ndarray, fl
     return layers == fullest, float(fullest * thickness)
 
 
-def _draw_plane(axes: Axes, scene: "Scene", points: np.ndarray, title: str) -> None:
+def _draw_plane(axes: Axes, scene: Scene, points: np.ndarray, title: str) -> None:
     """Draw points in the x-y plane as discs nearly one spacing wide, the domain, and the cutoff around one of them."""
     lower, upper = _bounds(scene)
     margin = 0.03 * float((upper - lower).max())
@@ -70,7 +67,7 @@ def _draw_plane(axes: Axes, scene: "Scene", points: np.ndarray, title: str) -> N
     axes.spines[["top", "right"]].set_visible(False)
 
 
-def _draw_space(axes: Axes3D, scene: "Scene", points: np.ndarray) -> None:
+def _draw_space(axes: Axes3D, scene: Scene, points: np.ndarray) -> None:
     """Draw points in space, the nearer ones darker, and the edges of the domain. The y axis points away from the reader."""
     lower, upper = _bounds(scene)
     nearness = points @ np.array([1.0, -1.0, 0.6])
@@ -94,7 +91,7 @@ def _draw_space(axes: Axes3D, scene: "Scene", points: np.ndarray) -> None:
     axes.view_init(elev=22, azim=-50)
 
 
-def _bounds(scene: "Scene") -> tuple[np.ndarray, np.ndarray]:
+def _bounds(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     """Return the lower and the upper corner of the domain [mm]."""
     lower = MILLI * np.array(scene.origin)
     return lower, lower + MILLI * np.array(scene.lengths)

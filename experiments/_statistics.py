@@ -58,11 +58,6 @@ class Summary(SearchRow):
     high_s: float | None = None
     confidence: float | None = None
 
-    @property
-    def sampled(self) -> list[float]:
-        """What the interval is made of: medians of processes, or the repeats of one [s]."""
-        return list(self.medians.values()) if len(self.medians) > 1 else self.seconds
-
 
 def summarize(rows: Iterable[SearchRow]) -> list[Summary]:
     """Return one row for each method on each scene, in the order of their first appearance."""

@@ -9,15 +9,14 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import psutil
 
-from experiments import _layouts, _machine, methods
+from cases import Scene
+from experiments import _accuracy, _compare, _layouts, _machine, _measure, _oracle, methods
 from experiments._config import Spec
-
-if TYPE_CHECKING:
-    from cases import Scene
 
 RUNNER = "JFRNN_RUNNER"  # environment variable: the process that asks, which this one is not to survive
 MOST_MEMORY = 0.8  # of the machine; a method that wants more gets an error instead of taking the machine down
@@ -47,8 +46,6 @@ def _answer(task: dict[str, Any]) -> dict[str, Any]:
 
 def prepare_oracle(spec: Spec, folder: Path) -> dict[str, Any]:
     """Leave the exact pairs of the scene in the folder; of a large one, those of a sample."""
-    from experiments import _compare, _oracle
-
     scene = make_scene(spec)
     if (n := len(scene.positions)) > _compare.MOST_LISTED:
         _oracle.load_sample(scene.positions, scene.cutoff, _compare.sample(n), folder)
@@ -76,17 +73,15 @@ def measure(spec: Spec, folder: Path) -> dict[str, Any]:
     return row
 
 
-def make_scene(spec: Spec) -> "Scene":
+def make_scene(spec: Spec) -> Scene:
     """Return the scene of a row."""
     options = {name: getattr(spec, name) for name in ("spacing", "cutoff_ratio", "dtype", "dim", "seed", "fill", "angle", "growth")}
     scene = _layouts.make(spec.layout, **options)
     return _layouts.order_scene(scene, spec.order, spec.seed)
 
 
-def _measure_search(adapter: methods.Adapter, spec: Spec, scene: "Scene", folder: Path, row: dict[str, Any]) -> None:
+def _measure_search(adapter: methods.Adapter, spec: Spec, scene: Scene, folder: Path, row: dict[str, Any]) -> None:
     """Time the search, then compare what it found; fill the row as far as it comes."""
-    from experiments import _measure, _oracle
-
     positions, cutoff = scene.positions, _oracle.round_cutoff(scene.cutoff, scene.positions.dtype)
     row["cutoff"], whole = cutoff, _measure.Bystanders()
     device = _measure.DeviceMemory()
@@ -127,8 +122,6 @@ def _measure_search(adapter: methods.Adapter, spec: Spec, scene: "Scene", folder
 
 def _judge(found: methods.Found, spec: Spec, positions: np.ndarray, cutoff: float, folder: Path, row: dict[str, Any]) -> None:
     """Compare what was found with the exact pairs, and in the first process sums over it with exact ones."""
-    from experiments import _accuracy, _compare, _oracle
-
     if (n := len(positions)) > _compare.MOST_LISTED:
         rows = _compare.sample(n)
         row |= _compare.compare_sample(found, _oracle.load_sample(positions, cutoff, rows, folder), rows, n)
@@ -161,8 +154,6 @@ def _prepare(
 
 def _limit_memory() -> None:
     """Keep this process below a share of the machine's memory; not where a GPU's driver reserves addresses without end."""
-    import psutil
-
     if not Path("/dev/nvidiactl").exists():
         most = int(MOST_MEMORY * psutil.virtual_memory().total)
         resource.setrlimit(resource.RLIMIT_AS, (most, most))

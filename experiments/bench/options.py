@@ -17,6 +17,7 @@ from experiments._commands import Engine, Points, Rounds
 from experiments._library import Name, round_capacity
 from experiments.bench import table
 from experiments.bench.options_scenes import FIRST, Asked, Option, beside, density, options
+from experiments.methods import scipy_kdtree_nolist
 
 Calls = dict[str, Callable[[], Any]]
 WHATS = ("list", "count", "sum")
@@ -157,8 +158,6 @@ def _ask_peers(row: table.Line, asked: Asked, ours: Callable[[], Any], rounds: i
 
 
 def _scipy(x: np.ndarray, cutoffs: np.ndarray) -> tuple[Callable[[], Any], Callable[[Any], np.ndarray]]:
-    from experiments.methods import scipy_kdtree_nolist
-
     strict = np.nextafter(cutoffs.astype(np.float64), 0)  # as it takes <=
     return scipy_kdtree_nolist.prepare(x, strict, workers=_machine.machine()["cores"]), lambda found: found - 1
 

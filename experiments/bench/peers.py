@@ -13,6 +13,7 @@ from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import typer
+from scipy.spatial import KDTree
 
 from experiments import _machine
 from experiments._commands import check_names, finite
@@ -55,8 +56,6 @@ def _jfrnn(given: Problem) -> Pairs:
 
 
 def _scipy(given: Problem) -> Pairs:
-    from scipy.spatial import KDTree
-
     points, size = given.positions.astype(np.float64), None
     if given.matrix is not None:
         if (given.matrix != np.diag(np.diag(given.matrix))).any():

@@ -10,6 +10,7 @@ from typing import Annotated, Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+import trimesh
 import typer
 
 import jfrnn
@@ -129,8 +130,6 @@ def _libigl(scene: _Scene) -> _Asked:
 
 
 def _trimesh(scene: _Scene) -> _Asked:
-    import trimesh
-
     mesh = trimesh.Trimesh(scene.vertices.astype(np.float64), scene.faces, process=False)
     asked = np.arange(min(_FEW, len(scene.points)))
     points = scene.points[asked].astype(np.float64)

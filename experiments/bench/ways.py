@@ -8,10 +8,14 @@ from collections.abc import Callable
 from time import perf_counter, sleep
 from typing import Any, NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+from scipy.spatial import KDTree
 
-from experiments import _layouts, _machine
-from experiments._library import Name
+import jfrnn
+from experiments import _layouts, _machine, _measure
+from experiments._library import Name, round_capacity
 
 MOST_ROWS = 20_000  # whose error is looked at; of more particles, evenly chosen ones
 
@@ -47,8 +51,6 @@ def poly6_scale(cutoff: float) -> float:
 
 def poly6(cutoff: float) -> Callable[[Any, Any, Any], Any]:
     """Return a density's kernel (Müller et al. 2003, doi:10.2312/SCA03/154-159) for `jfrnn.pair_sum`."""
-    import jax.numpy as jnp
-
     scale = poly6_scale(cutoff)
 
     def kernel(r: Any, i: Any, j: Any) -> Any:  # noqa: ANN401
@@ -59,9 +61,6 @@ def poly6(cutoff: float) -> Callable[[Any, Any, Any], Any]:
 
 def over_list(kernel: Callable[[Any, Any, Any], Any], x: Any, m: Any, idx: Any) -> Any:  # noqa: ANN401
     """Sum a kernel over the rows of a padded list [n, capacity] in plain JAX; slots from n on are unused."""
-    import jax
-    import jax.numpy as jnp
-
     used = idx < len(x)
     j = jnp.where(used, idx, 0)
     each = jax.vmap(jax.vmap(kernel, (0, None, 0)), (0, 0, 0))
@@ -73,8 +72,6 @@ def reference(given: Given, rows: np.ndarray, gradient: bool) -> tuple[np.ndarra
 
     Ties at the cutoff need no decision: the kernel and its gradient are 0 there.
     """
-    from scipy.spatial import KDTree
-
     x, m, h = np.asarray(given.x, np.float64), np.asarray(given.m, np.float64), given.cutoff
     found = KDTree(x).query_ball_point(x[rows], h)
     place, j = np.repeat(np.arange(len(rows)), [len(row) for row in found]), np.concatenate([*found]).astype(np.int64)
@@ -128,13 +125,9 @@ def measure(spec: dict[str, Any]) -> dict[str, Any]:
 
 def _measure_way(way: Way, spec: dict[str, Any], positions: np.ndarray, cutoff: float, row: dict[str, Any]) -> None:
     """Run once to compile, then for the time, once for the memory; fill the row as far as it comes."""
-    import jax
-
-    from experiments import _measure
-
     jax.config.update("jax_enable_x64", spec["dtype"] == "float64")
     masses = np.random.default_rng(spec["seed"]).uniform(0.5, 1.5, len(positions)).astype(positions.dtype)
-    given = Given(jax.numpy.asarray(positions), jax.numpy.asarray(masses), cutoff)
+    given = Given(jnp.asarray(positions), jnp.asarray(masses), cutoff)
     device = _measure.DeviceMemory()
     steps, building = way.prepare(given, spec["gradient"], spec["compensated"]), []
 
@@ -173,8 +166,6 @@ def _measure_way(way: Way, spec: dict[str, Any], positions: np.ndarray, cutoff: 
 
 def _compile(density: Callable[[Any, Any, Any], Any], gradient: bool) -> Callable[[Any, Any, Any], Any]:
     """Return a jitted density(x, m, made), or it and the gradient of the sum of all densities in x."""
-    import jax
-
     if not gradient:
         return jax.jit(density)
 
@@ -191,8 +182,6 @@ def _compile(density: Callable[[Any, Any, Any], Any], gradient: bool) -> Callabl
 
 def _steps_without_list(backend: Name) -> Callable[[Given, bool, bool], Steps]:
     def prepare(given: Given, gradient: bool, compensated: bool) -> Steps:
-        import jfrnn
-
         kernel, cutoff = poly6(given.cutoff), given.cutoff
 
         def density(x: Any, m: Any, made: Any) -> Any:  # noqa: ANN401
@@ -204,26 +193,15 @@ def _steps_without_list(backend: Name) -> Callable[[Given, bool, bool], Steps]:
 
 
 def _capacity(given: Given) -> int:
-    import jfrnn
-    from experiments._library import round_capacity
-
     return round_capacity(int(jfrnn.count(given.x, given.cutoff).max()))
 
 
 def _our_list(given: Given) -> Callable[[Any], Any]:
-    import jax
-
-    import jfrnn
-
     capacity, cutoff = _capacity(given), given.cutoff
     return jax.jit(lambda x: jfrnn.search(x, cutoff, capacity=capacity))
 
 
 def _our_flat_list(given: Given) -> Callable[[Any], Any]:
-    import jax
-
-    import jfrnn
-
     total, cutoff = jfrnn.search_edges(given.x, given.cutoff).total, given.cutoff
     return jax.jit(lambda x: jfrnn.search_edges(x, cutoff, total=total))
 
@@ -235,9 +213,6 @@ def _jax_md(given: Given) -> Callable[[Any], Any]:
 
 
 def _nvalchemi(given: Given) -> Callable[[Any], Any]:
-    import jax
-    import jax.numpy as jnp
-
     from experiments.methods import nvalchemi
 
     capacity = _capacity(given)
@@ -262,8 +237,6 @@ def _plain_sum_over(
 
 def _pair_sum_over(make: Callable[[Given], Callable[[Any], Any]]) -> Callable[[Given, bool, bool], Steps]:
     def prepare(given: Given, gradient: bool, compensated: bool) -> Steps:
-        import jfrnn
-
         kernel = poly6(given.cutoff)
 
         def density(x: Any, m: Any, nbrs: Any) -> Any:  # noqa: ANN401
@@ -275,8 +248,6 @@ def _pair_sum_over(make: Callable[[Given], Callable[[Any], Any]]) -> Callable[[G
 
 
 def _scipy(given: Given, *_: bool) -> Steps:
-    from scipy.spatial import KDTree
-
     points = np.asarray(given.x, np.float64)
     return Steps(None, lambda x, m, made: KDTree(points).query_pairs(given.cutoff, output_type="ndarray"))
 

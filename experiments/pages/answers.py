@@ -1,24 +1,20 @@
 """The table of what the thesis left open: ratios of times over rounds, with the intervals that hold them."""
 
 from functools import cache
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from experiments._rows import read_latest
-from experiments.pages.rows import RESULTS, markdown, number
-
-if TYPE_CHECKING:
-    from experiments._study import Effect
+from experiments import _study
+from experiments._study import Effect
+from experiments.pages.rows import markdown, number
 
 
 @cache
 def _rounds(sweep: str) -> Any:  # noqa: ANN401
     """Return the rounds of a sweep, a line per process."""
-    from experiments import _study
-
-    return _study.rounds(read_latest(RESULTS / sweep))
+    return _study.rounds(_study.rows(sweep))
 
 
-def _line(question: str, what: str, one: "Effect | None", memory: "Effect | None" = None) -> list[str]:
+def _line(question: str, what: str, one: Effect | None, memory: Effect | None = None) -> list[str]:
     assert one is not None, what
     interval = f"{number(one.low, digits=3)} to {number(one.high, digits=3)}"
     return [question, what, number(one.ratio, digits=3), interval, "" if memory is None else number(memory.ratio, digits=3)]
@@ -26,8 +22,6 @@ def _line(question: str, what: str, one: "Effect | None", memory: "Effect | None
 
 def answers() -> str:
     """Return a line for each comparison."""
-    from experiments import _study  # with pandas and statistics, which no other page needs
-
     thesis, turns, cubes, motion, order, domain = map(
         _rounds, ("thesis_cpu", "sweep_orientation", "sweep_cluster_size", "sweep_motion", "sweep_order", "sweep_domain")
     )

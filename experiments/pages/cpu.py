@@ -4,6 +4,7 @@ from functools import partial
 from statistics import median
 
 from experiments.pages.rows import TIMES, Row, machine, markdown, number, one, read, whole
+from jfrnn.cases.catalog import CATALOG
 
 OURS = {
     "warp": "jfrnn, list",
@@ -158,8 +159,6 @@ def triangles() -> str:
 
 def answers(rows: list[Row] | None = None) -> str:
     """Return what each library answers on the hard cases: those of the page, or those of other rows of `bench peers`."""
-    from jfrnn.cases.catalog import CATALOG
-
     rows = read("peers/answers.csv") if rows is None else rows
     versions = {row["peer"]: row["version"] for row in rows}
     lines = []

@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from scipy.integrate import solve_ivp
 
 REFERENCE = Path(__file__).parent.parent / "reference"
 VORTEX_STEP = 0.05  # of `vortices` [1/(kU)]; half of it changes dissipation at Re 100 by less than 1e-7
@@ -86,7 +87,6 @@ def drop_axis(times: np.ndarray, rate: float = 100.0) -> np.ndarray:
     With half axes 1/b and b, and v = A y, incompressible and without pressure at its surface: b' = A b and
     A' = A² (1 - b⁴)/(1 + b⁴). Source: Monaghan (1994), doi:10.1006/jcph.1994.1034, sec. 5.1.
     """
-    from scipy.integrate import solve_ivp
 
     def rates(_: float, now: np.ndarray) -> list[float]:
         b, a = now
