@@ -58,8 +58,10 @@ def pairs_of_search(problem: Problem, inputs: Inputs, summed: bool) -> Pairs:
     sources, queries = _bring_near(sources, queries, box, options.images, batch)
     unsure = (exclude is not None and exclude.valid is not None) or (batch is not None and batch.fit is not None)
     doubtful = by_data = several or box is not None or unsure
-    if doubtful and not any(isinstance(x, Tracer) for x in jax.tree.leaves(inputs)):
-        known = geometry.known_status(call_apart(lambda inputs: find_bits(inputs, options), inputs))
+    if doubtful:
+        traced = any(isinstance(x, Tracer) for x in jax.tree.leaves(lax.stop_gradient(inputs)))  # not below `jax.grad` alone
+        asked = options._replace(engine=ARRAYS) if traced else options  # a program calls no kernel for what it may not ask
+        known = geometry.known_status(call_apart(lambda inputs: find_bits(inputs, asked), inputs))
         problem.refuse(known, inputs)
         doubtful = known is None
 

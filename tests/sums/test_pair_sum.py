@@ -829,6 +829,24 @@ def test_errors(error, match, call):
     refuses(error, match, call)
 
 
+@pytest.mark.parametrize("backend", ["warp", "jax"])
+@pytest.mark.parametrize(
+    ("cutoff", "box"), [(0.9, jfrnn.Box([1.0, 1.0], images=0)), (np.array([0.5, -1.0, 0.5], np.float32), None)]
+)
+def test_what_data_say_is_raised_below_transformations_that_know_them(cutoff, box, backend):
+    """Derivatives of known positions are no program: an error is told there, too."""
+
+    def total(x):
+        return jfrnn.pair_sum(lambda r, i, j: r @ r, x, cutoff, box=box, backend=backend).sum()
+
+    x, match = jnp.asarray([[0.1, 0.2], [0.4, 0.3], [0.8, 0.9]], jnp.float32), "cutoff|box"
+    refuses(ValueError, match, total, x)
+    refuses(ValueError, match, jax.grad(total), x)
+    refuses(ValueError, match, lambda x: jax.jvp(total, (x,), (x,)), x)
+    refuses(ValueError, match, jax.jacfwd(jax.grad(total)), x)
+    assert np.isnan(jax.jit(jax.grad(total))(x)).all()
+
+
 @pytest.mark.parametrize("backend", ["warp", slow("jax")])
 def test_a_list_with_a_shorter_cutoff(backend):
     """A list serves two cutoffs: its own pairs, and those of a shorter one, with derivatives."""
