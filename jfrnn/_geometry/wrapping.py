@@ -49,7 +49,7 @@ class Wrapped(NamedTuple):
 
     @property
     def most_turns(self) -> Array:
-        """What `_most_turns` returns."""
+        """The largest number of turns along an axis, as a float."""
         return _most_turns(self.met, np.dtype(self.slack.dtype))
 
 

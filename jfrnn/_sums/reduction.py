@@ -59,14 +59,12 @@ def pairs_of_search(problem: Problem, inputs: Inputs, summed: bool) -> Pairs:
     unsure = (exclude is not None and exclude.valid is not None) or (batch is not None and batch.fit is not None)
     doubtful = by_data = several or box is not None or unsure
     if doubtful:
-        traced = any(isinstance(x, Tracer) for x in jax.tree.leaves(lax.stop_gradient(inputs)))  # not below `jax.grad` alone
-        asked = options._replace(engine=ARRAYS) if traced else options  # a program calls no kernel for what it may not ask
-        known = geometry.known_status(call_apart(lambda inputs: find_bits(inputs, asked), inputs))
+        known = geometry.known_status(call_apart(lambda inputs: find_bits(inputs, options), inputs))  # a program leaves it out
         problem.refuse(known, inputs)
         doubtful = known is None
 
     def mark(term: Term) -> Marked:
-        asked = options if is_fused(relation, term) else options._replace(engine=ARRAYS)  # no kernel is called for it alone
+        asked = options if is_fused(relation, term) else options._replace(engine=ARRAYS)  # not by a kernel for it alone
         return _prepare_marks(sources, queries, _good_rows_of_search, (inputs,), (asked, doubtful))
 
     plain = summed and active is None and not by_data
