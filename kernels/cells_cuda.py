@@ -48,6 +48,8 @@ GRID = {
     "MOST_LONG": MOST_LONG,
     "LEFT_OUT": _LEFT_OUT,
 }
+# Of blocks with more queries than 2 to the first there are parts, among so many queries (`native/cells/shares.h`).
+_PART_BITS, _MOST_PARTED = 2, 64 * _WARPS
 HEADER_WORDS = 64  # of the scratch
 # Blocks of kernels that walk in strides, per multiprocessor: no result depends on how many there are.
 _SWEEP = 8  # over all particles
@@ -105,7 +107,7 @@ class Kernels(NamedTuple):
 
     def launches(self, n: int, m: int, own: bool, multiprocessors: int) -> list[Launch]:
         """Return what is launched, in order, for n sources and m queries, on a device of so many multiprocessors."""
-        return self.stages(n, m, own, multiprocessors) + walks(self.query, self.crossing, m, multiprocessors)
+        return self.stages(n, m, own, multiprocessors) + walks(self.query, self.crossing, m, own, multiprocessors)
 
     def stages(self, n: int, m: int, own: bool, multiprocessors: int) -> list[Launch]:
         """Return those that sort sources and queries by cell."""
@@ -144,14 +146,17 @@ def _shares(m: int, bits: int) -> int:
     return -(-m >> bits)
 
 
-def walks(query: Kernel, crossing: Kernel | None, m: int, multiprocessors: int) -> list[Launch]:
-    """Return the launches that walk over m queries: those whose reach leaves a periodic box have a kernel of their own."""
-    threads = query_blocks(m) * QUERY_BLOCK
+def walks(query: Kernel, crossing: Kernel | None, m: int, own: bool, multiprocessors: int) -> list[Launch]:
+    """Return the launches that walk over m queries: those whose reach leaves a periodic box have a kernel of their own.
+
+    Where queries are the sources, warps to spare serve parts of blocks that are scattered (`native/walk/walk.cuh`).
+    """
+    blocks = query_blocks(m)
+    spare = blocks // 8 if own and share_bits(m) > _PART_BITS and m <= _MOST_PARTED else 0
+    walk = Launch(query, (spare + blocks) * QUERY_BLOCK, False, beside=crossing is not None)
     if crossing is None:
-        return [Launch(query, threads, False)]
-    most = _CROSSING * multiprocessors * QUERY_BLOCK
-    first = Launch(crossing, min(threads, most), False)  # what takes longest
-    return [first, Launch(query, threads, False, beside=True)]
+        return [walk]
+    return [Launch(crossing, min(blocks, _CROSSING * multiprocessors) * QUERY_BLOCK, False), walk]  # first what takes longest
 
 
 def walking_blocks(kind: Kind) -> int:

@@ -55,11 +55,11 @@ class Kernels(NamedTuple):
     query: Kernel
     crossing: Kernel | None
 
-    def launches(self, n: int, m: int, multiprocessors: int) -> list[Launch]:
+    def launches(self, n: int, m: int, own: bool, multiprocessors: int) -> list[Launch]:
         """Return what is launched, in order, for n sources and m queries, which are sorted already; as in a search."""
         threads = -(-n // QUERY_BLOCK) * QUERY_BLOCK
         sorting = [] if self.sort_values is None else [Launch(self.sort_values, threads, False)]
-        return sorting + walks(self.query, self.crossing, m, multiprocessors)
+        return sorting + walks(self.query, self.crossing, m, own, multiprocessors)
 
 
 def _reads_positions(term: TermText) -> bool:

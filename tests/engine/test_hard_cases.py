@@ -107,3 +107,19 @@ def test_every_case_as_it_is(name, dtype, dim, backend):
     for options in ({}, {"closed": True}):
         nbrs = jfrnn.search(given.positions, given.cutoff, queries=given.queries, backend=backend, **options)
         checked.assert_exact(nbrs, given.positions, given.cutoff, queries=given.queries, **options)
+
+
+@pytest.mark.parametrize("periodic", [False, True], ids=["open", "periodic along x"])
+def test_rows_of_cells_that_hold_few(periodic):
+    """Pairs of a ragged surface, whose queries CUDA serves in parts, are those of array programs, and rows the same each time."""
+    rng, cutoff = np.random.default_rng(5), np.float32(0.055)
+    body, strewn = rng.uniform(size=(40_000, 3)), rng.uniform(size=(600, 3))
+    strewn[:, 2] = 1 + cutoff * rng.integers(0, 12, 600)
+    x = np.concatenate([body, strewn]).astype(np.float32)
+    space = {"box": jfrnn.Box([1.0, 1.0, 1.0], periodic=[True, False, False])} if periodic else {}
+    rows = [jfrnn.search(x, cutoff, backend=backend, capacity=64, **space) for backend in ("warp", "warp", "jax")]
+    for nbrs in rows:
+        nbrs.check()
+    first, again, expected = (np.asarray(nbrs.idx) for nbrs in rows)
+    assert (first == again).all()
+    assert (np.sort(first, axis=1) == np.sort(expected, axis=1)).all()

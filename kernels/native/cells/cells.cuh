@@ -21,6 +21,7 @@ struct Shared {
     int tiles[2];   // tiles of the scan that have begun
     int crossing;   // blocks of queries that cross the box: the reach of one of them leaves it
     real unit;      // of the lattice on which all coordinates lie, or 0
+    int scattered;  // blocks of queries that are scattered over rows of cells
     int longs;      // queries with longer cutoffs than cells are made for
     int long_ids[MOST_LONG], long_places[MOST_LONG];
 };
@@ -56,6 +57,7 @@ struct Scratch {
     int* query_order;
     int* crossing;                   // their numbers: nobody asks for keys and slots once particles are scattered
     int* crosses;                    // whether a block does
+    int *scattered, *is_scattered;   // likewise, of blocks of eight queries or more: room enough for both beside the others
     unsigned int* leaves_near_long;  // marks of long queries (long.cuh), which stand there, too
 
     Node* nodes;  // of a tree, which takes the place of the cells
@@ -80,6 +82,8 @@ struct Scratch {
         query_order = own ? order : take(m);
         crossing = key;
         crosses = slot;
+        scattered = key + m / 4;
+        is_scattered = key + m / 2;
         leaves_near_long = (unsigned int*)slot;
     }
     JFRNN_FUNCTION long long up(long long words) { return (words + 15) & ~15ll; }
@@ -189,6 +193,7 @@ struct Search : SearchArguments, Cells, Thread, Shares, Scratch {
         }
         if (thread == 0) {
             shared.behind[0] = shared.behind[1] = shared.tiles[0] = shared.tiles[1] = shared.crossing = shared.longs = 0;
+            shared.scattered = 0;
             info[0] = info[1] = 0;
         }
     }
@@ -320,6 +325,22 @@ struct Search : SearchArguments, Cells, Thread, Shares, Scratch {
             shared.finite_queries = finite;
     }
 
+    // Marks blocks whose queries are scattered over rows of cells, as they are on a surface: there groups are small, and one warp would
+    // take as long for them as for many. `row` is that of a place, whichever of its cell stands there; places of a warp follow each
+    // other.
+    JFRNN_MEMBER void mark_scattered(int row, long long place) {
+        const long long left = n - (place - lane);
+        const unsigned int here = left < 32 ? (1u << (int)left) - 1 : ALL;
+        const int before = __shfl_up_sync(here, row, 1), size = 1 << share_bits;
+        const unsigned int begins = __ballot_sync(here, row != before);
+        if (lane % size > 0)
+            return;
+        const int groups = 1 + __popc(begins >> lane & (size < 32 ? (1u << size) - 1 : ALL) & ~1u);
+        const bool found = groups * PART_OF_BLOCK > size;
+        is_scattered[place >> share_bits] = found;
+        if (found)
+            scattered[atomicAdd(&shared.scattered, 1)] = (int)(place >> share_bits);
+    }
     // Puts positions into the order of cells, ranked by index within a cell: the same order in every run.
     JFRNN_MEMBER void gather_places() {
         const Grid grid = shared.grid;
@@ -354,8 +375,11 @@ struct Search : SearchArguments, Cells, Thread, Shares, Scratch {
             point_of(positions + (long long)ROW * i, mine.p);
             mine.id = bits_as_real(i);
             const unsigned int system = system_of(positions + (long long)ROW * i);
-            const int cell =
-                finite_point(mine.p) ? cell_key(grid, mine.p, system) : -1;  // cheaper than to fetch key[i] from anywhere
+            int row = -1;
+            const bool finite = finite_point(mine.p);
+            const int cell = finite ? cell_key(grid, mine.p, system, row) : -1;  // cheaper than to fetch key[i] from anywhere
+            if (own && may_part)
+                mark_scattered(row, place);
             long long to = place;
             if (cell >= 0) {
                 const int first = start[cell], end = start[cell + 1];

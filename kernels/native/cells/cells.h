@@ -165,15 +165,19 @@ struct Cells : Space {
         const whole r = x % cells;
         return (int)(r < 0 ? r + cells : r);
     }
-    // The entry of the cell of a finite point; a point outside a dense box is sorted into its border.
-    JFRNN_MEMBER int cell_key(const Grid& grid, const real* p, unsigned int system) const {
+    // The entry of the cell of a finite point; a point outside a dense box is sorted into its border. `row` becomes its row of cells.
+    JFRNN_MEMBER int cell_key(const Grid& grid, const real* p, unsigned int system, int& row) const {
         whole cell[3] = {0, 0, 0};
         for (int k = 0; k < DIM; ++k) {
             const whole c = axis_cell(grid, k, coordinate(k, p)), end = grid.extent[k] - 1;
             cell[k] = !grid.dense ? c : c < 0 ? 0 : c > end ? end : c;
         }
-        const int row = row_start(grid, cell[1], cell[2], system);
+        row = row_start(grid, cell[1], cell[2], system);
         return grid.dense ? row + (int)cell[0] : ring(row + ring(cell[0], grid.cells), grid.cells);
+    }
+    JFRNN_MEMBER int cell_key(const Grid& grid, const real* p, unsigned int system) const {
+        int row;
+        return cell_key(grid, p, system, row);
     }
     // Finds how many cells the box [low, high] of coordinates has, and whether a table of so many entries holds them.
     JFRNN_MEMBER void lay_out(Grid& grid, const real* low, const real* high, int table) const {

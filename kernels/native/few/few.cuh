@@ -34,6 +34,7 @@ struct FewPairs : FewArguments, Space {
     real q[3];
     real sure_square, far_square;  // of distances, squared: what is closer surely is a neighbor, what is farther surely none
     real length[3];                // of the box along each axis, 0 where it is not periodic
+    real around[3];                // its size, infinite where it is not periodic
     bool tight;                    // the cutoff is about half of a length: on which side the nearest image is may be in doubt
     bool is_finite;
     unsigned int system;
@@ -60,6 +61,7 @@ struct FewPairs : FewArguments, Space {
         far_square = outer * outer * (1 + 16 * step_eps);
         for (int k = 0; k < DIM; ++k) {
             length[k] = PERIODIC && lattice.periodic(k) ? lattice.vector(k, k) : real(0);
+            around[k] = length[k] != 0 ? size_of(length[k]) : Bits::not_finite();
             tight = tight || (length[k] != 0 && outer > real(0.49) * size_of(length[k]));
         }
     }
@@ -72,16 +74,14 @@ struct FewPairs : FewArguments, Space {
         const int ahead = (d > 0) == (length[k] > 0) ? -1 : 1;
         return length[k] != 0 && (size_of(d) > half) != other ? ahead : 0;
     }
-    JFRNN_MEMBER real moved(int k, real p, int image) const {
-        return image == 0 ? p : Lattice::add(p, Lattice::mul(real(image), length[k]));
-    }
-    // |p - q|^2 - square in working precision, negative for what is closer.
+    // |p - q|^2 - square in working precision, negative for what is closer. In a box, the nearest image of p is the other way around
+    // where that is shorter: along each axis this is off by no more than an image that is moved, for which `slack` allows.
     JFRNN_MEMBER real excess(const real* q, const real* p, real square) const {
         real sum = -square;
 #pragma unroll
         for (int k = 0; k < DIM; ++k) {
-            const real d = (PERIODIC ? moved(k, p[k], nearest(k, q[k], p[k])) : p[k]) - q[k];
-            sum += d * d;
+            const real d = fabs(p[k] - q[k]), nearest = PERIODIC ? fmin(d, around[k] - d) : d;
+            sum += nearest * nearest;
         }
         return sum;
     }
@@ -111,8 +111,8 @@ struct FewPairs : FewArguments, Space {
     }
 
     // Finds what may be neighbors: bits of the words of the share of this thread, in `near`. Returns whether the sources that this
-    // thread has loaded are finite.
-    JFRNN_MEMBER bool find(Bits32* near) const {
+    // thread has loaded are finite; `doubtful` becomes whether any of what its warp has found may be none.
+    JFRNN_MEMBER bool find(Bits32* near, bool& doubtful) const {
         __shared__ Point all[FEW_WARPS];
         __shared__ unsigned int systems[BATCHED ? FEW_WARPS : 1];
         if (warp == 0 && lane % OF_WARP == 0) {
@@ -123,7 +123,8 @@ struct FewPairs : FewArguments, Space {
                 systems[slot] = system;
         }
         __syncthreads();
-        bool finite = true;
+        const real doubt = sure_square - far_square;  // what exceeds the far square by less surely is a neighbor
+        bool finite = true, any_doubt = false;
         for (int begin = 0; begin < OF_WARP * words && (warp * OF_WARP * words + begin) * 32 < n; begin += AT_ONCE) {
             real p[AT_ONCE][3];
             unsigned int of_source[AT_ONCE];
@@ -135,7 +136,9 @@ struct FewPairs : FewArguments, Space {
                 const Point point = all[other];
 #pragma unroll
                 for (int i = 0; i < AT_ONCE; ++i) {
-                    bool is_near = excess(point.at, p[i], far_square) < 0;
+                    const real over = excess(point.at, p[i], far_square);
+                    bool is_near = over < 0;
+                    any_doubt |= is_near && !(over < doubt);
                     if constexpr (BATCHED)
                         is_near = is_near && of_source[i] == systems[other];
                     const unsigned int bits = __ballot_sync(EVERY, is_near);
@@ -145,6 +148,7 @@ struct FewPairs : FewArguments, Space {
                 }
             }
         }
+        doubtful = __any_sync(EVERY, any_doubt);
         __syncwarp();
         for (int k = 0; k < words; ++k)
             near[k][threadIdx.x] = first_of(k) < n ? allowed(near[k][threadIdx.x], first_of(k)) : 0;
@@ -174,7 +178,7 @@ struct FewPairs : FewArguments, Space {
     // Calls `meet(j, p, code)` for all neighbors among the sources of this thread, in ascending order: source, where it is, image.
     // In `near` no others stay.
     template <class Meet>
-    JFRNN_MEMBER void meet_all(Bits32* near, Meet meet) const {
+    JFRNN_MEMBER void meet_all(Bits32* near, bool doubtful, Meet meet) const {
         const Excluded mine(excluded_starts, excluded, is_query ? query : 0);
         unsigned int rest = 0;
         for (int k = 0;;) {
@@ -187,7 +191,7 @@ struct FewPairs : FewArguments, Space {
             real p[3];
             point_of(positions + (long long)ROW * j, p);
             int code = PERIODIC && (SUMS || EXCLUDING == 2) ? code_of(p) : 0;
-            const bool near_enough = excess(q, p, sure_square) < 0 || is_exact_pair(p, j, code);
+            const bool near_enough = !doubtful || excess(q, p, sure_square) < 0 || is_exact_pair(p, j, code);
             if (near_enough && !(EXCLUDING && mine.has(Excluded::id_of(j, code, n))))
                 meet(j, p, code);
             else

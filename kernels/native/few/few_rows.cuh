@@ -13,9 +13,14 @@ struct FewRows : FewRowsArguments {
         __shared__ FewPairs::Bits32 near[WORDS];
         __shared__ int counted[FEW_WARPS][SHARES + 1];
         const FewPairs pairs(*this, later_only);
-        const bool finite = pairs.find(near);
+        bool doubtful;
+        const bool finite = pairs.find(near, doubtful);
         int found = 0;
-        pairs.meet_all(near, [&](int, const real*, int) { ++found; });
+        if (doubtful || EXCLUDING)
+            pairs.meet_all(near, doubtful, [&](int, const real*, int) { ++found; });
+        else
+            for (int k = 0; k < pairs.words; ++k)
+                found += __popc(near[k][threadIdx.x]);
         counted[pairs.slot][pairs.share] = found;
         const bool not_finite = __syncthreads_or(!finite || (pairs.is_query && !pairs.is_finite));
         // from here on a warp has the row of one query

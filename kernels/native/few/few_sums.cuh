@@ -18,8 +18,9 @@ struct FewSums : FewSumsArguments {
         const Term term(shared_values);
         const Term::Own own_part = term.own(own_values + (long long)OWN * (pairs.is_query ? pairs.query : 0), pairs.q);
         Reduction reduction(n);
-        pairs.find(near);
-        pairs.meet_all(near, [&](int j, const real* p, int of_image) {
+        bool doubtful;
+        pairs.find(near, doubtful);
+        pairs.meet_all(near, doubtful, [&](int j, const real* p, int of_image) {
             const real* const row = others + (long long)COLUMNS * j;
             auto column = [&](int c) -> number {
                 if (c < OTHERS)

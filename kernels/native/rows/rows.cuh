@@ -63,6 +63,7 @@ struct RowPlace {
 };
 
 struct Rows : Walk<Rows> {
+    static constexpr bool BY_BLOCK = false;
     static constexpr int STEP = FLAT ? 8 : 1;  // between slots that a lane writes: those of a flat list one by one
     JFRNN_MEMBER explicit Rows(const SearchArguments& given) : Walk(given) {}
     JFRNN_MEMBER void open(int) {}

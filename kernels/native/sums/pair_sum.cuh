@@ -29,6 +29,7 @@ struct Taken {
 };
 
 struct Sums : Walk<Sums> {
+    static constexpr bool BY_BLOCK = TOTALS > 0;
     static constexpr bool NAMED = SUMS == 2;  // the sources of summands are asked for
     const real *shared_values, *own_values, *values;
     const Results results;

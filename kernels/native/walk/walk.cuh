@@ -2,6 +2,7 @@
 //
 // A warp serves its share of the queries in groups. What becomes of the pairs is said by the struct that derives from `Walk`, by
 // these members:
+//   BY_BLOCK         whether what comes of a block must come from one warp
 //   open(block)      comes before the queries of a block of shares; there may be none
 //   none(id)         a query that is not finite has no candidates
 //   settle(group, pairs, finished)  of pairs that are held, what is done with them: those of blocks of candidates below
@@ -20,28 +21,39 @@ struct Walk : PairSearch {
 
     JFRNN_MEMBER void run() {
         if constexpr (TREE) {
-            serve(block);
+            serve(block, 0, 32);
             return;
         }
-        if (PERIODIC && !CROSSING && (block >= query_blocks || crosses[block]))
-            return;
-        if constexpr (CROSSING)
-            for (int turn = block; turn < shared.crossing; turn += (int)(threads / 32))
-                serve(crossing[turn]);
-        else
-            serve(block);
+        // Behind whole blocks, each of which has a warp of its own, or a turn where queries cross, come parts of the scattered ones,
+        // unless there are many: to spare warps, which begin before the others.
+        const int warps = (int)(threads / 32), spare = CROSSING ? warps : warps - query_blocks;
+        const bool has_one = block >= spare, parted = !Query::BY_BLOCK && own && may_part && shared_known().grid.dense &&
+                                                      shared.scattered <= query_blocks / 8;
+        const int bits = share_bits - PART_BITS, blocks = CROSSING ? shared.crossing : 0;
+        const int parts = parted ? shared.scattered << bits : 0;
+#pragma unroll 1
+        for (int turn = block; has_one || turn < blocks + parts; turn += spare) {
+            const bool whole = has_one || turn < blocks;
+            const int part = turn - blocks, of = has_one ? block - spare : whole ? crossing[turn] : scattered[part >> bits];
+            const bool is_mine = !PERIODIC || (crosses[of] != 0) == CROSSING, is_split = parts > 0 && is_scattered[of];
+            if (is_mine && is_split != whole)
+                serve(of, whole ? 0 : (part & ((1 << bits) - 1)) * PART_OF_BLOCK, whole ? 32 : PART_OF_BLOCK);
+            if (has_one)
+                break;
+        }
     }
-    // Serves the queries of a block. Those with the largest cutoffs of all may lie far from each other and have many candidates each: no
-    // block serves two of them. In a tree they come first; of cells it is those that these are not made for.
-    JFRNN_MEMBER void serve(int block) {
+    // Serves queries of a block: from one of them on, at most so many. Those with the largest cutoffs of all may lie far from each other
+    // and have many candidates each: no block serves two of them. In a tree they come first; of cells it is those that these are not
+    // made for.
+    JFRNN_MEMBER void serve(int block, int from, int most) {
         constexpr int MOST_APART = TREE ? 32 : 0;
         const int share = 1 << share_bits, first_ones = query_blocks < MOST_APART ? query_blocks : MOST_APART;
         const int apart = LONG ? shared_known().longs : first_ones;
-        const long long begin = (long long)block << share_bits, end = begin + share;
+        const long long begin = ((long long)block << share_bits) + from, end = begin + (share < most ? share : most);
         served = block;
         query().open(block);
 #pragma unroll 1
-        for (bool alone = block < apart;; alone = false) {
+        for (bool alone = block < apart && from == 0;; alone = false) {
             const int rest = begin < first_ones ? first_ones : begin < m ? (int)begin : m;
             const int place = !alone ? rest : LONG ? shared.long_places[block] : block;
             if (place >= 0)

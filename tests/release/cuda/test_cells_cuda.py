@@ -156,6 +156,13 @@ def test_few_queries_are_shared_among_more_warps():
     assert cells_cuda.query_blocks(0) == 0
 
 
+def test_parts_of_blocks_have_warps_to_spare():
+    """Where blocks have parts and are few enough that one may be the last to end; queries beside the sources are not marked."""
+    kernels = cells_cuda.cell_kernels(Kind(3, False, lists=True))
+    for n, own, spare in ((16_000, True, 0), (64_000, True, 500), (64_000, False, 0), (10**6, True, 0)):
+        assert kernels.launches(n, n, own, 132)[-1].threads == 32 * (cells_cuda.query_blocks(n) + spare)
+
+
 SHARE = """
 struct CountArguments {
     const int* queries;

@@ -130,7 +130,7 @@ def test_what_a_term_reads_is_sorted_before_it_is_summed(periodic):
     box = jfrnn.Box([2.0, 2.0, 2.0]) if periodic else None
     plan = plan_of(functools.partial(square_sum, box=box), *arguments(np.float32, 3)[:3])
     kernels = pair_sum_cuda.sum_kernels(Kind(3, False, periodic=periodic), plan.text, plan.key)
-    launches = kernels.launches(1000, 500, 132)
+    launches = kernels.launches(1000, 500, False, 132)
     assert [launch.kernel for launch in launches] == [kernels.sort_values, *[kernels.crossing] * periodic, kernels.query]
     assert [launch.beside for launch in launches] == [False, False] + [True] * periodic
     assert periodic or launches[-1].threads == 32 * pair_sum_cuda.slots(500)
