@@ -302,7 +302,7 @@ def check_box(box: object, positions: Array, like: Box | None = None) -> Box | N
     if like is not None and _kind_of(box) != _kind_of(like):
         was, came = (_kind_of(b) for b in (like, box))
         raise ValueError(f"box must be of the kind with which the list was made ({was}), got {came}.")
-    return box if any(box.periodic) or box.fractional else None
+    return box if any(box.periodic) or box.fractional or box.per_system else None
 
 
 def _kind_of(box: Box) -> str:

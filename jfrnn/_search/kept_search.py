@@ -287,9 +287,9 @@ class KeptSearch(KeptOptions):
             rows = geometry.check_again("queries", queries, problem.dtype, problem.dim, self._row_count, self.status)
         if box is None:
             box = self.box
-        elif self.box is None:
-            raise ValueError("this list was made without a periodic box: leave box out.")
         elif (box := geometry.check_box(box, sources, like=self.box)) is not None:
+            if self.box is None:
+                raise ValueError("this list was made without a periodic box: leave box out.")
             box = geometry.round_box(box.of_list(self.box.images_of_list, like=self.box), problem.dtype)
         if box is not None and box.fractional:
             sources, rows = real_points(sources, rows, box, self.batch, problem.options.engine.native)

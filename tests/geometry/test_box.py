@@ -342,6 +342,14 @@ def test_bad_boxes_say_what_is_wrong(error, match, make):
     refuses(error, match, make)
 
 
+def test_a_box_without_a_periodic_axis_may_be_given_again():
+    """To a list that was made with it, as code does whose axes are those of data."""
+    box = jfrnn.Box(LENGTHS, periodic=False)
+    nbrs = jfrnn.search(X, 1.0, box=box)
+    np.testing.assert_array_equal(nbrs.update(X, box=box).count, nbrs.count)
+    assert jfrnn.pair_sum(lambda r, i, j: 1.0, X, None, neighbors=nbrs, box=box).shape == (len(X),)
+
+
 # --- how many images -------------------------------------------------------------------------------------------------------
 
 

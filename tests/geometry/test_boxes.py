@@ -229,6 +229,17 @@ def test_numbers_without_a_box_are_told():
     refuses(ValueError, "names systems for which `box` holds no box", nbrs.check)
 
 
+@pytest.mark.parametrize("backend", ["warp", slow("jax")])
+def test_numbers_mean_the_same_where_no_axis_is_periodic(backend):
+    """Said for all systems or for each: particles of -1 are nowhere, and numbers without a box are told."""
+    x, cells = np.random.default_rng(0).uniform(size=(6, 3)), np.stack([np.eye(3)] * 2)
+    for periodic in (False, np.zeros((2, 3), bool)):
+        given = {"box": jfrnn.Box(cells, periodic), "backend": backend}
+        np.testing.assert_array_equal(jfrnn.count(x, 2.0, batch=np.array([0, -1, -1, 1, 1, 1]), **given), [0, 0, 0, 2, 2, 2])
+        unknown = functools.partial(jfrnn.count, x, 2.0, batch=np.array([0, 5, 5, 1, 1, 1]), **given)
+        refuses(ValueError, "names systems for which", unknown)
+
+
 X, SYSTEMS, CELLS = np.zeros((4, 3)), np.zeros(4, np.int32), np.stack([np.eye(3)] * 2)
 
 

@@ -379,6 +379,20 @@ def partly_active():
     return jnp.asarray(x), jnp.asarray(np.where(active, m, np.nan)), active
 
 
+@pytest.mark.parametrize("backend", ["warp", "jax", slow("brute")])
+def test_particles_that_are_not_there_have_no_extreme(backend):
+    """Nor have those of no system, where each system has a box."""
+    x = np.random.default_rng(0).uniform(size=(6, 2))
+    nowhere = np.array([False, False, True, False, False, True])
+    in_boxes = {"box": jfrnn.Box(np.stack([np.eye(2)] * 2)), "batch": np.where(nowhere, -1, 0)}
+    for given in ({"active": ~nowhere}, in_boxes):
+        for reduce, none in (("max", -np.inf), ("min", np.inf)):
+            found = jfrnn.pair_sum(lambda r, i, j: r @ r, x, 0.45, reduce=reduce, backend=backend, **given)
+            np.testing.assert_array_equal(found[nowhere], none)
+            others = found[~nowhere]
+            assert np.all((others > 0) & (others < 0.45**2) | (others == none))
+
+
 @pytest.mark.parametrize(
     ("backend", "second"), [("list", False), ("warp", False), *slowly(ENGINES[0], ("brute", False), ("jax", False))]
 )

@@ -23,10 +23,10 @@ struct SumRows {
             memcpy(errors + at, &x, 4);
     }
     JFRNN_MEMBER int integer_at(long long at) const { return Lattice::packed_turns(errors[at]); }
-    // Fills the row of a query whose position is not finite, from the sum `first` on every one of `stride`.
+    // Fills the row of a query whose position is not finite, or that is not there, from the sum `first` on every one of `stride`.
     JFRNN_MEMBER void clear(int id, int first = 0, int stride = 1) const {
         for (int r = first; r < ROW_SUMS; r += stride)
-            at(id, r) = MARKED[r] ? Bits::no_number() : real(0);
+            at(id, r) = MARKED[r] ? Bits::no_number() : SUMS == 2 ? -Bits::not_finite() : real(0);
         for (int r = first; SUMS == 2 && r < 2 * ROW_SUMS; r += stride)
             put_integer(2ll * ROW_SUMS * id + r, r % 2 ? 0 : n);
     }
