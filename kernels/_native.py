@@ -108,6 +108,7 @@ class Kind(NamedTuple):
             "SCALED": self.scaled,
             "EXCLUDING": self.excluding,
             "FLAT": self.flat,
+            "LATER": self.later,
             "RULE": RULES.index(self.rule) if self.rule else -1,
             "BOXES": self.batched == OWN_BOXES,
             "TREE": self.tree,

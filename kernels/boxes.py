@@ -62,7 +62,7 @@ def rows_kernel(kind: Kind) -> Kernel:
 
 
 def _constants(kind: Kind) -> dict[str, int]:
-    return {"LIST": kind.lists, "LATER": kind.later, "LANES_PER_ROW": LANES}
+    return {"LIST": kind.lists, "LANES_PER_ROW": LANES}
 
 
 @functools.lru_cache(512)

@@ -54,4 +54,4 @@ def sort_kernels(kind: Kind) -> tuple[Kernel, Kernel]:
 def query_kernel(kind: Kind) -> Kernel:
     """Return what lists or counts, whose work threads share."""
     constants = {**GRID, "SUMS": 0, "LIST": kind.lists, **CHUNKS, "TOGETHER": TOGETHER, "CANDIDATES": CANDIDATES[kind.double]}
-    return declare_kind(kind.compiled("later"), "cells_cpu", "rows_cpu.h", "Rows.run", constants=constants)[0]
+    return declare_kind(kind.compiled(), "cells_cpu", "rows_cpu.h", "Rows.run", constants=constants)[0]

@@ -167,7 +167,7 @@ def walking_blocks(kind: Kind) -> int:
 @functools.lru_cache(512)
 def cell_kernels(kind: Kind) -> Kernels:
     """Return the kernels that sort by cell, and that list or count."""
-    compiled, constants = kind.compiled(), {"LIST": kind.lists, "SUMS": 0, "LATER": kind.later, **GRID}
+    compiled, constants = kind.compiled(), {"LIST": kind.lists, "SUMS": 0, **GRID}
 
     def query_kernel(name: str, crossing: bool = False) -> Kernel:
         entry = Entry("Rows.run", QUERY_BLOCK, walking_blocks(kind), "Rows_cross" * crossing)

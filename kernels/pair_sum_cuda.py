@@ -88,7 +88,6 @@ def sum_kernels(kind: Kind, term: TermText, key: str) -> Kernels:
         **GRID,
         **constants_of(term, kind, by_rows=True),
         "LIST": 0,
-        "LATER": 0,
         "TAKEN": 4 if cheap else 2,
         "FROM_PLACES": from_places,
     }

@@ -63,4 +63,4 @@ def sort_kernels(kind: Kind) -> tuple[Kernel, Kernel]:
 def query_kernel(kind: Kind) -> Kernel:
     """Return what lists or counts, whose work threads share."""
     constants = {**_constants(kind), "CANDIDATES": cells_cpu.CANDIDATES[kind.double]}
-    return declare_kind(kind.compiled("later"), "tree_cpu", "rows_cpu.h", "Rows.run", given=PROVIDER, constants=constants)[0]
+    return declare_kind(kind.compiled(), "tree_cpu", "rows_cpu.h", "Rows.run", given=PROVIDER, constants=constants)[0]

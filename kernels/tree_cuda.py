@@ -55,6 +55,6 @@ def walk_threads(queries: int) -> int:
 @functools.lru_cache(512)
 def query_kernel(kind: Kind) -> Kernel:
     """Return the kernel that lists or counts."""
-    constants = {**GRID, "CROSSING": kind.periodic > 0, "LIST": kind.lists, "SUMS": 0, "LATER": kind.later}
+    constants = {**GRID, "CROSSING": kind.periodic > 0, "LIST": kind.lists, "SUMS": 0}
     entry = Entry("Rows.run", QUERY_BLOCK, walking_blocks(kind), "Rows_of_tree")
     return declare_kind(kind.compiled()._replace(tree=True), "tree_cuda", "rows.cuh", entry, cuda=True, constants=constants)[0]

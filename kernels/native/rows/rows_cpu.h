@@ -26,14 +26,13 @@ struct RowsBy : Way<RowsBy<Way>>, RowsOut {
     void meet(const real* q, int id, bool fresh, bool finished) {
         const int before = fresh ? 0 : count[id];
         int hits;
-        if (LIST && !FLAT && !past_caches) {
+        if (LIST && !FLAT && !past_caches) {  // what is written to the caches is written in place: nothing waits for it
             int* const out = idx + (long long)id * capacity;
             if (fresh)
                 fill(out);
-            hits = scan_within(q, id, out + before, capacity - before);
+            hits = this->template scan<true>(q, id, filled, out + before, capacity - before);
         } else {
-            hits = later_only ? this->template scan<true, false>(q, id, filled, row, 0)
-                              : this->template scan<false, false>(q, id, filled, row, 0);
+            hits = this->template scan<false>(q, id, filled, row, 0);
             if constexpr (LIST)
                 write_row(id, before, hits, finished);
         }
@@ -56,11 +55,6 @@ struct RowsBy : Way<RowsBy<Way>>, RowsOut {
             __atomic_fetch_or(&info[1], 1, __ATOMIC_RELAXED);
     }
 
-    // What is written to the caches alone is written in place: nothing waits for what was written before.
-    int scan_within(const real* q, int id, int* to, int room) {
-        return later_only ? this->template scan<true, true>(q, id, filled, to, room)
-                          : this->template scan<false, true>(q, id, filled, to, room);
-    }
     void fill(int* out) const {
         const ints filling = ints{} + fill_value;
         for (int s = 0; s + LANES <= capacity; s += LANES)

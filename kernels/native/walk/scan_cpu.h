@@ -297,10 +297,22 @@ struct Scan : SearchArguments, SystemCells, SourcePlaces {
             doubtful[doubts + e] = 0;
         return doubts;
     }
+    // Adds the pairs among what is unsure of `count` candidates to `hits`, as `scan` does. It is apart, or compilers would take as long
+    // for it as for all the rest.
+    JFRNN_APART int settle_unsure(const real* q, int own_id, int count, int* to, int room, int hits) {
+        const int doubts = collect_doubtful(count);
+        for (int b = 0; b < doubts; b += LANES) {
+            unsigned int pairs = decided(q, own_id, doubtful_at(b), doubtful + b, lanes_before(doubts - b));
+            for (; pairs; pairs &= pairs - 1, ++hits)
+                if (LIST && hits < room)
+                    to[hits] = candidate_ids[doubtful[b + __builtin_ctz(pairs)]];
+        }
+        return hits;
+    }
     // Counts which of `count` candidates are pairs of a query; LIST: leaves their ids in `to`, of which as many as fit into `room`;
-    // without BOUNDED there is room for all. ONLY_LATER: those alone that come after the query. It takes a load, a difference, a
-    // product and a comparison per axis or candidate, LANES at a time.
-    template <bool ONLY_LATER, bool BOUNDED>
+    // without BOUNDED there is room for all. It takes a load, a difference, a product and a comparison per axis or candidate, LANES at
+    // a time.
+    template <bool BOUNDED>
     int scan(const real* q, int own_id, int count, int* to, int room) {
         const Band<real> of_query{inside, outside};  // stays in registers, whatever is stored
         const Excluded mine = excluded_by(own_id);
@@ -309,7 +321,7 @@ struct Scan : SearchArguments, SystemCells, SourcePlaces {
         for (int b = 0, v = 0; b < count; b += LANES, ++v) {
             const vec square = square_of(q, candidates_at(b).p);
             const auto band = band_at(b, of_query);
-            unsigned int allowed = others_mask(b) & (ONLY_LATER ? later_mask(b, own_id) : ~0u);
+            unsigned int allowed = others_mask(b) & (LATER ? later_mask(b, own_id) : ~0u);
             if constexpr (EXCLUDING)
                 allowed = wanted(mine, b, allowed & (mask_of(square, band.outside, BelowOrAt{}) | sure_mask(b)));
             const unsigned int hit = (mask_of(square, band.inside, Below{}) | sure_mask(b)) & allowed;
@@ -321,13 +333,6 @@ struct Scan : SearchArguments, SystemCells, SourcePlaces {
                 pack(*(const ints*)(candidate_ids + b), to + hits, hit);
             hits += __builtin_popcount(hit);
         }
-        const int doubts = any_unsure ? collect_doubtful(count) : 0;
-        for (int b = 0; b < doubts; b += LANES) {
-            unsigned int pairs = decided(q, own_id, doubtful_at(b), doubtful + b, lanes_before(doubts - b));
-            for (; pairs; pairs &= pairs - 1, ++hits)
-                if (LIST && (!BOUNDED || hits < room))
-                    to[hits] = candidate_ids[doubtful[b + __builtin_ctz(pairs)]];
-        }
-        return hits;
+        return any_unsure ? settle_unsure(q, own_id, count, to, BOUNDED ? room : 0x7fffffff, hits) : hits;
     }
 };
