@@ -144,6 +144,18 @@ def test_few_cutoffs_much_longer_than_the_rest(dtype, dim, apart):
         assert total.tolist() == rows.tolist()
 
 
+def test_few_cutoffs_much_longer_than_those_of_many():
+    """So many that CUDA serves their queries in more blocks than one each."""
+    random = np.random.default_rng(2)
+    x, cutoffs = random.random((20_000, 3)).astype(np.float32), np.full(20_000, 0.03, np.float32)
+    cutoffs[random.permutation(20_000)[:12]] = 0.25
+    nbrs = jfrnn.search(x, cutoffs, capacity=1792, backend="warp")
+    nbrs.check()
+    expected = jfrnn.search(x, cutoffs, capacity=1792, backend="jax")
+    np.testing.assert_array_equal(np.sort(nbrs.idx, axis=1), np.sort(expected.idx, axis=1))
+    np.testing.assert_array_equal(jfrnn.pair_sum(lambda r, i, j: 1.0, x, cutoffs, backend="warp"), expected.count)
+
+
 @pytest.mark.parametrize(("name", "rule", "dtype", "dim", "backend", "way"), list(each_case()))
 def test_case(name, rule, dtype, dim, backend, way):
     often = way == "few" and rule in ("gather", "either", "mean") and name != "queries"  # the mask is a program of its own

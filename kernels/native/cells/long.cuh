@@ -26,13 +26,18 @@ struct LongQueries : Search {
     JFRNN_MEMBER void mark() {
         if (!has_long_queries())
             return;
+        __shared__ int ids[MOST_LONG];
         __shared__ real at[MOST_LONG][3], cutoffs[MOST_LONG], near_square[MOST_LONG];
         const int longs = shared.longs;
-        if ((int)threadIdx.x < longs) {
+        if ((int)threadIdx.x < longs) {  // in the order of their ids: which block adds up whose pairs is the same in every run
             const int id = shared.long_ids[threadIdx.x];
-            point_of(queries + (long long)ROW * id, at[threadIdx.x]);
-            cutoffs[threadIdx.x] = query_radii[id];
-            near_square[threadIdx.x] = PairCutoffs::outside_of(query_radii[id] * step_scale, real(0));
+            int k = 0;
+            for (int other = 0; other < longs; ++other)
+                k += shared.long_ids[other] < id;
+            ids[k] = id;
+            point_of(queries + (long long)ROW * id, at[k]);
+            cutoffs[k] = query_radii[id];
+            near_square[k] = PairCutoffs::outside_of(query_radii[id] * step_scale, real(0));
         }
         __syncthreads();
         for (long long first = thread - lane; first < n; first += threads) {
@@ -46,7 +51,7 @@ struct LongQueries : Search {
                     square += d * d;
                 }
                 bool is_near = is_there && square <= near_square[k];
-                if (is_near && own && square == 0 && id_of(here.id) == shared.long_ids[k])
+                if (is_near && own && square == 0 && id_of(here.id) == ids[k])
                     shared.long_places[k] = (int)place;
                 if (!DOUBLE && is_near)  // far away, floats tell few points apart
                     is_near = is_within(here.p, at[k], cutoffs[k]);
@@ -56,7 +61,7 @@ struct LongQueries : Search {
         }
         for (long long place = thread; !own && place < shared.finite_queries; place += threads)
             for (int k = 0; k < longs; ++k)
-                if (query_order[place] == shared.long_ids[k])
+                if (query_order[place] == ids[k])
                     shared.long_places[k] = (int)place;
     }
     // Is a point within a cutoff of another, or so close to that that float64 does not tell?

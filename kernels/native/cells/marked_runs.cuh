@@ -1,5 +1,5 @@
 // The runs of candidates of a group: cells within its reach or, of a query with a longer cutoff than cells know, what is marked as near
-// (long.cuh). A block serves the one of its own number.
+// (long.cuh). With a block of queries goes the one of its number.
 #pragma once
 #include "runs.cuh"
 
@@ -22,7 +22,7 @@ struct MarkedRuns : CellRuns {
         }
     }
     JFRNN_MEMBER unsigned int marks(const PairSearch& search, int word) const {
-        return search.leaves_near_long[search.words_of_long(search.block) + word];
+        return search.leaves_near_long[search.words_of_long(search.served) + word];
     }
     JFRNN_MEMBER bool are_left() const { return is_marked ? waiting != 0 : CellRuns::are_left(); }
     JFRNN_MEMBER int find(const PairSearch& search, const Group& group) {

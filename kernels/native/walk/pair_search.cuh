@@ -23,11 +23,12 @@ struct PairSearch : ImageSearch {
     const real* of_kinds;    // the cutoffs of its species
     PairCutoffs::Bounds<real> own_bounds;
     real between;  // what `Known` says of one cutoff, for that of this query
+    int served;    // the block of queries that is served
     // Where coordinates lie on a lattice, cutoffs of queries are decided on it as one cutoff is.
     static constexpr bool SITED = RULE == GATHER && !TREE;
 
     JFRNN_MEMBER explicit PairSearch(const SearchArguments& given)
-        : ImageSearch(given), own_radius(0), upper(0), of_kinds(nullptr), own_bounds{0, 0}, between(0) {
+        : ImageSearch(given), own_radius(0), upper(0), of_kinds(nullptr), own_bounds{0, 0}, between(0), served(0) {
         Known& known = shared_known();
         if (lane == 0) {
             known.site = !SCALED || SITED ? shared.unit : real(0);

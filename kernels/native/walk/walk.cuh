@@ -14,8 +14,6 @@
 
 template <class Query>
 struct Walk : PairSearch {
-    int served;  // the block of queries that is served
-
     JFRNN_MEMBER explicit Walk(const SearchArguments& given) : PairSearch(given) {}
     JFRNN_MEMBER Query& query() { return *static_cast<Query*>(this); }
 
