@@ -189,8 +189,9 @@ def check_physics(physics: Any) -> None:  # noqa: ANN401
         if isinstance(value, Tracer):
             continue
         value = np.asarray(value).tolist() if isinstance(value, np.ndarray | np.generic | jax.Array) else value
+        value = tuple(value) if isinstance(value, list) else value
         try:
-            ranges.read(kinds[field.name], value, ranges.RANGES.get(field.name))
+            ranges.read(kinds[field.name], value, ranges.RANGES.get(field.name), strict=True)
         except ValueError as error:
             raise SceneError(f"physics.{field.name}: got {value!r}; {error}") from error
 

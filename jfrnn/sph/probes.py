@@ -142,11 +142,16 @@ def _check_vector(name: str, value: Sequence[float], count: int) -> np.ndarray:
     return array
 
 
+_TAKEN = ("step", "time", "time [s]")
+
+
 def check_names(probes: dict[str, Probe]) -> None:
     """Refuse what are no functions by names that can stand in the head of a table."""
     if not isinstance(probes, dict):
         raise SceneError(f"probes must be a dict of functions by name, got {type(probes).__name__}.")
     for name, probe in probes.items():
+        if name in _TAKEN:
+            raise SceneError(f"probes must not be called {name!r}, as a column of each table is: take another name.")
         if not isinstance(name, str) or not name or set(name) & set(',"\n') or not callable(probe):
             raise SceneError(f"probes must be functions by names without a comma, got {name!r}: {probe!r}.")
 

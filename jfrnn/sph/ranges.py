@@ -48,14 +48,16 @@ OF_SCENES: dict[tuple[str, str], Bounds] = {
 _SIGNS = {"gt": "above", "ge": "from", "lt": "below", "le": "to"}
 
 
-def read(kind: Any, value: object, bounds: Bounds | None) -> Any:  # noqa: ANN401
+def read(kind: Any, value: object, bounds: Bounds | None, strict: bool = False) -> Any:  # noqa: ANN401
     """Return a value, as JSON has it or a text, as its annotation says, within bounds of `RANGES`; None for what is no number.
+
+    Where `strict`, a text is no number and no bool, nor is a bool a number.
 
     Raises:
         ValueError: In a line, what the value is not, and its range.
     """
     try:
-        return TypeAdapter(_within(kind, bounds)).validate_python(value)
+        return TypeAdapter(_within(kind, bounds)).validate_python(value, strict=strict)
     except ValidationError as error:
         message = error.errors()[0]["msg"].lower()
         raise ValueError(message + (f" ({in_words(bounds)})" if bounds is not None else "")) from error

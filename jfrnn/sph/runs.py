@@ -1,6 +1,5 @@
 """Run a scene: in chunks of steps, a snapshot, a line of energies and a picture after each, from the last snapshot on."""
 
-import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +11,7 @@ import numpy as np
 from jax import Array
 
 import jfrnn
-from jfrnn.cases.fluids import GasScene, Scene
+from jfrnn.cases.fluids import Scene
 from jfrnn.sph import health, ranges, series, settings, snapshots, solids, solver
 from jfrnn.sph.errors import SceneError
 from jfrnn.sph.interrupts import hold_interrupts
@@ -113,6 +112,8 @@ def run(
             s = jax.jit(solver.begin)(model, s, nbrs)
             write.line(s, step)
             write.snapshot(s, nbrs, step)
+        else:
+            write.check(s)
         write.series(step)
         moments = how.frames * how.lines
         progress = Progress(how.frames, round(how.frames * float(s.time) / scene.duration))
@@ -158,12 +159,7 @@ def _go_to(
 
 def _describe(scene: Scene, how: How, dtype: type) -> dict[str, Any]:
     """Return what a run must have in common with one that it goes on with."""
-    return settings.describe(scene) | {
-        "dtype": np.dtype(dtype).name,
-        "frames": how.frames,
-        "lines": how.lines,
-        "given": _digest(scene),
-    }
+    return settings.describe(scene) | {"dtype": np.dtype(dtype).name, "frames": how.frames, "lines": how.lines}
 
 
 def _first_neighbors(scene: Scene, model: Flow, s: State, how: How) -> Neighbors:
@@ -176,14 +172,6 @@ def _first_neighbors(scene: Scene, model: Flow, s: State, how: How) -> Neighbors
             f"neighbors 'list': which pairs scene {scene.name!r} has{thin} changes in every step; take pair_sum or auto"
         )
     return nbrs
-
-
-def _digest(scene: Scene) -> str:
-    """Return 12 hex digits that stand for the particles and the solid of a scene."""
-    arrays = [scene.positions, scene.velocities, scene.masses]
-    arrays += [scene.energies] if isinstance(scene, GasScene) else []
-    arrays += [scene.solid.vertices, scene.solid.faces] if scene.solid else []
-    return hashlib.sha256(b"".join(np.ascontiguousarray(a).tobytes() for a in arrays)).hexdigest()[:12]
 
 
 def _chunk(model: Flow, s: State, nbrs: Neighbors, goal: float, most: int) -> tuple[State, Neighbors, int]:
@@ -222,12 +210,23 @@ class _Writer:
     def line(self, s: State, step: int) -> dict[str, float]:
         """Add a line to each table, and return the energies."""
         self._line = snapshots.energies(self._model, s, self._scene)
-        snapshots.add_line(self._line, self._folder / "energies.csv", step, s.x.shape[1])
-        if self._probe is not None:
-            seen = self._probe(self._model, s).items()
-            values = {key: number for name, value in seen for key, number in columns(name, value).items()}
-            snapshots.add_line({"time": self._line["time"]} | values, self._folder / "probes.csv", step, s.x.shape[1])
+        for name, line in self._tables(s).items():
+            snapshots.add_line(line, self._folder / name, step)
         return self._line
+
+    def check(self, s: State) -> None:
+        """Refuse to go on with tables of other columns."""
+        self._line = snapshots.energies(self._model, s, self._scene)
+        for name, line in self._tables(s).items():
+            snapshots.check_columns(line, self._folder / name)
+
+    def _tables(self, s: State) -> dict[str, dict[str, float]]:
+        """Return a line of each table, by its file: numbers by the heads of their columns."""
+        tables = {"energies.csv": {snapshots.head(name, s.x.shape[1]): value for name, value in self._line.items()}}
+        if self._probe is None:
+            return tables
+        seen = {key: number for name, value in self._probe(self._model, s).items() for key, number in columns(name, value).items()}
+        return tables | {"probes.csv": {snapshots.head("time", s.x.shape[1]): self._line["time"]} | seen}
 
     def snapshot(self, s: State, nbrs: Neighbors, step: int) -> None:
         """Write the state of the last line, and draw it."""

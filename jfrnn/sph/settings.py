@@ -1,15 +1,17 @@
 """What a run may be told: the name of a scene, and `--set key=value` for it."""
 
+import hashlib
 import inspect
 import json
 from collections.abc import Callable
-from dataclasses import fields, replace
+from dataclasses import fields, is_dataclass, replace
 from typing import Any
 
+import jax
 import numpy as np
 
 from jfrnn.cases import fluids
-from jfrnn.cases.fluids import FluidScene, GasScene, Scene
+from jfrnn.cases.fluids import Scene
 from jfrnn.sph import ranges
 from jfrnn.sph.check import PHYSICS, PHYSICS_OF_GASES, check_scene
 from jfrnn.sph.errors import SceneError
@@ -75,7 +77,17 @@ def _value(scene: str, key: str, text: str, kind: Any) -> Any:  # noqa: ANN401
 
 
 def describe(scene: Scene) -> dict[str, Any]:
-    """Return what a scene says, but its particles: what a run must have in common with one that it goes on with."""
-    assert isinstance(scene, FluidScene | GasScene), "a scene is of one of two kinds"
-    physics = {item.name: getattr(scene.physics, item.name) for item in fields(scene.physics)}
-    return {"name": scene.name, "particles": scene.n, "duration": scene.duration, "step": scene.step, "physics": physics}
+    """Return what a run must have in common with one that it goes on with: all of a scene but what pictures show."""
+    return {"particles": scene.n} | _describe(replace(scene, bounds=None))
+
+
+def _describe(value: Any) -> Any:  # noqa: ANN401
+    """Return a value as JSON holds it: 12 hex digits stand for what is in an array."""
+    if is_dataclass(value):
+        return {item.name: _describe(getattr(value, item.name)) for item in fields(value)}
+    if isinstance(value, tuple | list):
+        return [_describe(part) for part in value]
+    if not isinstance(value, np.ndarray | np.generic | jax.Array):
+        return value
+    known = np.ascontiguousarray(value)
+    return known.item() if np.ndim(value) == 0 else hashlib.sha256(known.tobytes()).hexdigest()[:12]

@@ -131,25 +131,35 @@ def energies(model: Flow, state: State, scene: Scene) -> dict[str, float]:
     return line if distances is None else line | {"clearance": float(distances.min(initial=np.inf))}
 
 
-def add_line(line: dict[str, float], path: Path, step: int, dim: int) -> None:
-    """Add a line to a CSV file; lines of this step and later, of a run that was stopped, are removed before.
+def add_line(line: dict[str, float], path: Path, step: int) -> None:
+    """Add a line to a CSV file, by heads of columns; lines of this step and later, of a run that was stopped, are removed before.
 
-    Heads say units where they are known, those of a slice 1 m thick in 2D, such as "kinetic [J/m]".
+    Raises:
+        SceneError: The file has other columns.
     """
-    text = ["step," + ",".join(_head(name, dim) for name in line)]
-    if path.exists():
-        text += [old for old in path.read_text().splitlines()[1:] if int(old.split(",")[0]) < step]
+    text = check_columns(line, path)
+    text = text[:1] + [old for old in text[1:] if int(old.split(",")[0]) < step]
     part = path.with_suffix(".part")
     part.write_text("\n".join([*text, ",".join([str(step), *(f"{value:.12g}" for value in line.values())])]) + "\n")
     part.replace(path)
 
 
-def _head(name: str, dim: int) -> str:
+def check_columns(line: dict[str, float], path: Path) -> list[str]:
+    """Return the lines of a CSV file to which one with such columns may be added: of a new one its head."""
+    heads = ",".join(["step", *line])
+    there = (path.read_text().splitlines() if path.exists() else []) or [heads]
+    if there[0] != heads:
+        raise SceneError(f"{path}: has the columns {there[0]}, and this run {heads}: give it the same probes, or another folder.")
+    return there
+
+
+def head(name: str, dim: int) -> str:
+    """Return the head of a column of energies: with the unit, in 2D that of a slice 1 m thick, such as "kinetic [J/m]"."""
     kind = name.partition("_")[0] if name.startswith(("momentum", "mass")) else name
     if kind not in _OF_LINES:
         return name
     unit, per_meter = _OF_LINES[kind]
-    return f"{name} [{unit if dim == len('xyz') else per_meter}]" if unit else name
+    return f"{name} [{unit if dim == len('xyz') else per_meter}]"
 
 
 def add_to_series(path: Path, time: float, step: int) -> None:

@@ -19,6 +19,7 @@ from vtkmodules.vtkIOHDF import vtkHDFReader
 
 import jfrnn
 from jfrnn import sph
+from jfrnn.cases import fluids
 from jfrnn.sph import toml_scenes
 from jfrnn.sph.errors import SceneError
 from jfrnn.sph.particles import mass_there
@@ -95,6 +96,7 @@ def test_a_mistake_in_a_probe_is_named(probe, message):
         ([spring], "probes must be a dict of functions by name, got list"),
         ({"a, b": spring}, "probes must be functions by names without a comma, got 'a, b'"),
         ({"a": 1.0}, "probes must be functions by names without a comma, got 'a': 1.0"),
+        ({"time": spring}, "probes must not be called 'time'"),
     ],
 )
 def test_a_mistake_in_names_of_probes_is_named(tmp_path, probes, message):
@@ -118,6 +120,42 @@ def test_a_run_goes_on_for_longer_and_writes_a_table(tmp_path):
     assert json.loads((tmp_path / "a" / "run.json").read_text())["duration"] == 0.2
     with pytest.raises(SceneError, match="holds a run with another duration, frames"):
         sph.run(replace(scene, duration=0.3), tmp_path / "a", short, probes=probes)
+
+
+def test_probes_of_another_table_are_refused_before_the_run_goes_on(tmp_path):
+    """A column of a probe is called as the probe is: a unit stands where the library knows it."""
+    scene, how = replace(FREE, duration=0.1), sph.How(frames=1, pictures=False)
+    probes = {name: lambda model, s: s.time for name in ("mass_flow", "second")}
+    sph.run(scene, tmp_path, how, probes=probes)
+    assert (tmp_path / "probes.csv").read_text().splitlines()[0] == "step,time [s],mass_flow,second"
+    there = (tmp_path / "energies.csv").read_bytes()
+    longer, more, fewer = replace(scene, duration=0.2), replace(how, frames=2), {"second": probes["second"]}
+    refuses(SceneError, r"has the columns .*,second, and this run .*\]", sph.run, longer, tmp_path, more, probes=fewer)
+    assert (tmp_path / "energies.csv").read_bytes() == there
+
+
+FLOWING = scene_of(
+    fluids.lattice((0.0, 0.0), (4, 4), 0.1), 0.1, fluids.Physics(density=1000.0, sound_speed=10.0, smoothing=0.15), duration=0.01
+)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"periodic": fluids.Periodic((0.0, 0.0), (0.4, 0.4), (True, True))},
+        {"outflow": fluids.Tank((-np.inf, -np.inf), (0.2, np.inf))},
+        {"enters": np.full(16, 0.005), "guided": 0.01},
+        {"wall": np.arange(16) < 4},
+        {"spacing": 0.11},
+        {"solid": fluids.Solid(np.array([[2.0, 0], [3, 0], [2, 1]]), np.array([[0, 1], [1, 2], [2, 0]]))},
+    ],
+    ids=lambda change: next(iter(change)),
+)
+def test_a_run_of_a_scene_that_differs_in_anything_is_another(tmp_path, change):
+    how = sph.How(frames=1, pictures=False)
+    sph.run(FLOWING, tmp_path, how)
+    sph.run(replace(FLOWING, bounds=fluids.Tank((0.0, 0.0), (9.0, 9.0))), tmp_path, how)  # what pictures show may change
+    refuses(SceneError, f"holds a run with another {next(iter(change))}", sph.run, replace(FLOWING, **change), tmp_path, how)
 
 
 BATH = """
@@ -241,6 +279,8 @@ def test_a_mistake_in_what_is_written_is_named(tmp_path, more, message):
         ("sound_speed = 10.0", "sound = 10.0", "physics: got an unexpected keyword argument 'sound'"),
         ("density = 1000.0", "density = -1.0", "physics.density: got -1.0; input should be greater than 0"),
         ("density = 1000.0", "cfl = 0.0\ndensity = 1000.0", "physics.cfl: got 0.0; input should be greater than 0"),
+        ("density = 1000.0", 'density = "1000"', "physics.density: got '1000'; input should be a valid number"),
+        ("density = 1000.0", 'slip = "no"\ndensity = 1.0', "physics.slip: got 'no'; input should be a valid boolean"),
         ("density = 1000.0", 'kernel = "gauss"\ndensity = 1.0', "physics.kernel: got 'gauss'; input should be 'cubic', "),
         ("upper = [0.4, 0.3]", "upper = [0.04, 0.3]", "fill: from .* there is no room for particles 0.1 m apart"),
         ("velocity = [0.5, 0.0]", "velocity = [0.5]", "fill.velocity must have 2 numbers"),
