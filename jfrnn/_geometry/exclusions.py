@@ -135,7 +135,8 @@ def pairs_of_rows(rows: IndexRows) -> Array:
         rows: Numbers of particles, shape [n, k], integers; unused places hold -1. A pair may stand in the rows of both or of one.
 
     Returns:
-        Pairs (i, rows[i, ...]), shape [n·k, 2], of the dtype of the rows. Those of unused places hold a -1, and exclude nothing.
+        Pairs (i, rows[i, ...]), shape [n·k, 2], of the dtype of the rows, or int32 if that cannot number n. Those of
+            unused places hold a -1, and exclude nothing.
 
     Raises:
         TypeError, ValueError: rows are no integers, or have another shape.
@@ -151,6 +152,8 @@ def pairs_of_rows(rows: IndexRows) -> Array:
         told = f"{given.dtype} of shape {list(given.shape)}" if hasattr(given, "dtype") else type(given).__name__
         raise TypeError(f"rows must be signed integers of shape [n, k], got {told}.")
     xp: Any = jnp if isinstance(given, Array) else np
+    if given.shape[0] > np.iinfo(given.dtype).max:
+        given = given.astype(np.int32)
     own = xp.broadcast_to(xp.arange(given.shape[0], dtype=given.dtype)[:, None], given.shape)
     return xp.stack([own, given], axis=-1).reshape(-1, 2)
 

@@ -88,6 +88,8 @@ def neighbor_list(
     """
     form, cutoff, skin = check_format(format), float(r_cutoff), float(dr_threshold)
     reach = cutoff + skin
+    if not (0 < cutoff < np.inf and 0 <= skin < np.inf):
+        raise ValueError(f"r_cutoff must be finite and above 0, and dr_threshold finite and not below 0, got {cutoff} and {skin}.")
 
     def own_space(dim: int) -> Space | None:
         return Space(box, fractional_coordinates) if displacement_or_metric is None else space_of(displacement_or_metric, dim)
@@ -142,6 +144,11 @@ def neighbor_list(
             raise TypeError(
                 "allocate() chooses shapes from positions and cannot run inside jax.jit: call it outside, update inside."
             )
+        if not jnp.issubdtype(position.dtype, jnp.floating):
+            raise TypeError(f"position must hold floats, got {position.dtype}.")
+        if not bool(jnp.isfinite(position).all()):
+            at = int(jnp.argmin(jnp.isfinite(position).all(axis=1)))
+            raise ValueError(f"position must be finite, got {position[at]} of particle {at}.")
         n, dim = position.shape
         space = own_space(dim)
         exact = space is not None and space.fractional == fractional_coordinates and not _DEFORM & kwargs.keys()
@@ -198,7 +205,8 @@ def neighbor_list(
 
         idx, held, reference = rebuild() if skin == 0 else lax.cond(moved, rebuild, keep)
         code = neighbors.error.code | jnp.where(held > room, 1, 0).astype(jnp.uint8)
-        code = code if new is None else code | _code_of(new.status)
+        status = jnp.where(jnp.isfinite(position).all(), 0, Status.NONFINITE.value) if new is None else new.status
+        code = code | _code_of(status)
         error, held = partition.PartitionError(code), jnp.maximum(held, neighbors.occupancy)
         now = {"reference_position": reference, "error": error, "kept": new, "occupancy": held, "measured_in": measured_in}
         return dataclasses.replace(neighbors, idx=idx, **now)

@@ -38,7 +38,8 @@ def nearest_of(points: Array, corners: Array) -> tuple[Array, Array]:
         j = (i + 1) % dim
         along = minus(x[j], x[i])
         length = dot(along, along)
-        place = jnp.clip(jnp.where(length > 0, -dot(x[i], along) / jnp.where(length > 0, length, 1), 0), 0, 1)
+        free = jnp.where(length > 0, -dot(x[i], along) / jnp.where(length > 0, length, 1), 0)
+        place = jnp.where(free > 0, jnp.where(free < 1, free, 1), 0)  # `clip` has half a derivative at its bounds
         here = [a + place * b for a, b in zip(x[i], along, strict=True)]
         here = [jnp.where(place < 1, h, b) for h, b in zip(here, x[j], strict=True)]
         what = jnp.where(place <= 0, i, jnp.where(place >= 1, j, _SIDE + i))
@@ -82,7 +83,8 @@ def pseudonormals(
 
     The pseudonormal of a face is its normal, that of a side the sum of the normals of the faces sharing it, and that of a vertex
     the sum over the faces around it, weighted with their angles; in 2D a vertex has the sum of both segments. All these faces are
-    equally near, so they are in the same row. Faces [f, corner] int32 run counterclockwise as seen from outside, so do segments
+    equally near, so they are in the same row. Where normals cancel, as those of parts that touch, it is that of the nearest face.
+    Faces [f, corner] int32 run counterclockwise as seen from outside, so do segments
     around what they enclose; their corners are [f, corner, d], and those that are valid `good` [f].
     Rows idx [n, capacity] have so many slots `used` [n]; the nearest point of each lies on a `feature` [n] of a `triangle` [n].
     Source: Baerentzen & Aanaes (2005), doi:10.1109/TVCG.2005.49.
@@ -101,7 +103,10 @@ def pseudonormals(
         weights = _weights(faces[known], faces[triangle[own]], corners[known], features)
         alone = features >= (_FACE if faces.shape[1] == 3 else _SIDE)
         weights = jnp.where(alone[:, None], (slots == triangle[own, None]).astype(weights.dtype), weights)
-        sums = jnp.sum(jnp.where(there, weights, 0)[..., None] * _face_normals(corners[known]), axis=1)
+        weights = jnp.where(there, weights, 0)
+        sums = jnp.sum(weights[..., None] * _face_normals(corners[known]), axis=1)
+        cancel = jnp.max(jnp.abs(sums), axis=1) <= 16 * jnp.finfo(sums.dtype).eps * jnp.sum(weights, axis=1)
+        sums = jnp.where(cancel[:, None], _face_normals(corners[triangle[own]]), sums)
         return normals.at[place].set(_unit(sums), mode="drop")
 
     none = jnp.zeros((n, corners.shape[2]), corners.dtype)

@@ -171,6 +171,24 @@ def test_boxes_that_change():
     refuses(ValueError, "displacement_or_metric given", jax_md.neighbor_list(None, 1.0, CUTOFF).allocate, x)
     refuses(ValueError, "format must be a member of NeighborListFormat", jax_md.neighbor_list, None, 1.0, CUTOFF, format="Dense")
     refuses(TypeError, r"cannot run inside jax.jit", jax.jit(lambda x: jax_md.neighbor_list(free, 1.0, CUTOFF).allocate(x).idx), x)
+    for cutoff, skin in ((np.nan, 0.0), (-1.0, 0.0), (CUTOFF, -0.1), (np.inf, 0.0)):
+        refuses(ValueError, "r_cutoff must be finite and above 0", jax_md.neighbor_list, free, 3.0, cutoff, skin)
+    refuses(
+        TypeError, "position must hold floats, got int", jax_md.neighbor_list(free, 3.0, CUTOFF).allocate, np.zeros((4, 3), int)
+    )
+
+
+@pytest.mark.parametrize("measured", [False, True])
+def test_positions_that_are_not_finite_are_told(measured):
+    """Where the function is asked about all pairs, too."""
+    x = points(False, 20)
+    lost = x.copy()
+    lost[3] = np.nan
+    fns = jax_md.neighbor_list(free, LENGTHS, CUTOFF, SKIN, disable_cell_list=measured)
+    refuses(ValueError, "position must be finite, got .* of particle 3", fns.allocate, lost)
+    nbrs = fns.allocate(x)
+    assert not fns.update(x, nbrs).did_buffer_overflow
+    assert fns.update(lost, nbrs).did_buffer_overflow
 
 
 def test_boxes_of_lists_that_are_measured():

@@ -290,6 +290,14 @@ def test_rows_of_partners_are_pairs():
     assert image_pairs(nbrs, x) == expected_pairs("exclude", x, None, bonded, None)
 
 
+def test_rows_of_partners_may_be_narrower_than_numbers_of_particles():
+    rows = np.full((300, 1), -1, np.int8)
+    rows[260] = 5
+    for given in (rows, jnp.asarray(rows)):
+        pairs = np.asarray(jfrnn.pairs_of_rows(given))
+        assert pairs[(pairs >= 0).all(axis=1)].tolist() == [[260, 5]]
+
+
 def test_one_excludes_very_many():
     """More than a kernel looks at one by one before it searches the row of them."""
     x = np.random.default_rng(1).random((100, 3)).astype(np.float32)

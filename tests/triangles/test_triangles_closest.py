@@ -136,6 +136,24 @@ def test_signed_distance_to_a_cube():
     assert min(np.sum(expected[8:][clear] < 0), np.sum(expected[8:][clear] > 0)) > 30
 
 
+def test_at_a_corner_the_derivative_of_the_distance_is_the_normal():
+    vertices, faces = meshes.cube(2.0, 1)
+    x = jnp.asarray(vertices)
+    tri = jfrnn.search_triangles(x, vertices, faces, 0.5)
+    slope = jax.grad(lambda x: jnp.sum(tri.signed_distance(x).distance))(x)
+    np.testing.assert_allclose(slope, np.sign(vertices) / np.sqrt(3), rtol=1e-12)
+    np.testing.assert_allclose(tri.signed_distance(x).normal, slope, rtol=1e-12)
+
+
+def test_where_normals_of_parts_cancel_that_of_the_nearest_face_counts():
+    """Two cubes that touch in a face, all of whose sides they share: the middle of it is on a diagonal of both."""
+    vertices, faces = meshes.cube(2.0, 1)
+    both = np.concatenate([vertices, vertices + np.array([2.0, 0, 0])]), np.concatenate([faces, faces + len(vertices)])
+    x = np.array([[1.0, 0, 0], [1.0, 0.3, 0.2], [1.0, 0.5, -0.5]])
+    signed = jfrnn.search_triangles(x, *jfrnn.merge_vertices(*both), 0.2).signed_distance(x)
+    np.testing.assert_allclose(np.abs(signed.normal), np.tile([1.0, 0, 0], (3, 1)), atol=1e-12)
+
+
 def test_signed_distance_to_a_wall_that_has_moved():
     """Rows know the wall where it was, sides and distances are those of where it is."""
     x, by = np.random.default_rng(2).uniform(-1.6, 1.6, (200, 3)), np.array([0.3, -0.2, 0.1])

@@ -142,7 +142,7 @@ FLOWING = scene_of(
 @pytest.mark.parametrize(
     "change",
     [
-        {"periodic": fluids.Periodic((0.0, 0.0), (0.4, 0.4), (True, True))},
+        {"periodic": fluids.Periodic((0.0, 0.0), (0.8, 0.8), (True, True))},
         {"outflow": fluids.Tank((-np.inf, -np.inf), (0.2, np.inf))},
         {"enters": np.full(16, 0.005), "guided": 0.01},
         {"wall": np.arange(16) < 4},
