@@ -126,7 +126,7 @@ def memory_plan(
     n, queries = check_size("n", n), None if queries is None else check_size("queries", queries)
     dim, dtype = check_kind(dim, dtype)
     radius = make_cutoff(check_cutoff(cutoff, dtype), dtype, closed=False)
-    rows = n if queries is None else queries
+    rows, gradient = n if queries is None else queries, check_flag("gradient", gradient)
     where = engine.default_platform() if platform is None else platform
     _check_parts(faces, queries, fn, capacity, gradient or values is not None)
     if total is not None and not (faces is None and fn is None and capacity is None):

@@ -447,6 +447,15 @@ def wrong_arguments_are_named():
     x, mesh = np.zeros((20, 2)), mesh_of(2)
     raises(ValueError, "skewed", distributed.scatter, x, 0.1, mesh=mesh, box=jfrnn.Box([[1.0, 0.0], [0.5, 1.0]]))
     raises(TypeError, "mesh", distributed.scatter, x, 0.1, mesh=4)
+    raises(ValueError, "[n, 2] or [n, 3], got [300, 4]", distributed.scatter, np.zeros((300, 4)), 0.1, mesh=mesh)
+    for along in ("x", [True], [0.0], [2]):
+        raises(ValueError, "along must name 1 different axes", distributed.scatter, x, 0.1, mesh=mesh, along=along)
+    particles = distributed.scatter(x, 0.1, mesh=mesh)
+    for slack in (0.1, np.nan):
+        raises(ValueError, "slack must be finite and at least 1", particles.grow, slack=slack)
+    raises(TypeError, "seen must be particles, lists or halos of jfrnn.distributed, got int", particles.grow, 5)
+    for ask in (distributed.migrate, distributed.collect, distributed.halo):
+        raises(TypeError, "particles must be what jfrnn.distributed.scatter returns, got an array", ask, x)
     raises(ValueError, "mesh", distributed.scatter, x, 0.1, mesh=mesh_of(2, 2, 2))
     raises(ValueError, "along", distributed.scatter, x, 0.1, mesh=mesh, along=(2,))
     raises(ValueError, r"values['m']", distributed.scatter, x, 0.1, {"m": np.zeros(7)}, mesh=mesh)

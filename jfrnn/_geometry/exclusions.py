@@ -136,7 +136,7 @@ def pairs_of_rows(rows: IndexRows) -> Array:
 
     Returns:
         Pairs (i, rows[i, ...]), shape [n·k, 2], of the dtype of the rows, or int32 if that cannot number n. Those of
-            unused places hold a -1, and exclude nothing.
+        unused places hold a -1, and exclude nothing.
 
     Raises:
         TypeError, ValueError: rows are no integers, or have another shape.

@@ -367,14 +367,18 @@ def check_kind(dim: object, dtype: Given) -> tuple[int, np.dtype]:
     """Return the dimension and dtype of the positions of a planned search."""
     if isinstance(dim, bool) or not isinstance(dim, int | np.integer) or dim not in (2, 3):
         raise ValueError(f"dim must be 2 or 3, got {_describe(dim)}.")
-    if np.dtype(dtype) not in (np.float32, np.float64):
-        raise TypeError(f"dtype must be float32 or float64, got {np.dtype(dtype)}.")
-    if np.dtype(dtype) == np.float64 and not jax.config.read("jax_enable_x64"):
+    try:
+        known = np.dtype(dtype)
+    except TypeError:
+        known = None
+    if known not in (np.float32, np.float64):
+        raise TypeError(f"dtype must be float32 or float64, got {_describe(dtype) if known is None else known}.")
+    if known == np.float64 and not jax.config.read("jax_enable_x64"):
         raise TypeError(
             "dtype is float64, but JAX's 64-bit mode is off, so that no search can have such positions: call "
             'jax.config.update("jax_enable_x64", True) at start-up, or pass dtype=np.float32.'
         )
-    return int(dim), np.dtype(dtype)
+    return int(dim), known
 
 
 def _describe(value: object) -> str:

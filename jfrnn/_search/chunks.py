@@ -8,7 +8,7 @@ import numpy as np
 from jax import Array
 from jax.core import Tracer
 
-from jfrnn._geometry import Box
+from jfrnn._geometry import Box, check_slack
 from jfrnn._search.kept_search import Kept, KeptSearch
 from jfrnn._tracing import Flags, Numbers, Points, Real, own_transfers
 
@@ -70,16 +70,29 @@ def run_chunk(
     if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((state, nbrs))):
         raise TypeError("run_chunk() changes the shape of the list and cannot run inside jax.jit: jit the chunk, not the loop.")
     given: dict[str, Any] = {"queries": queries, "active": active, "box": box, "cutoff": cutoff}
+    _check(chunk, nbrs, {"positions": positions} | {name: of for name, of in given.items() if of is not None})
+    slack = check_slack(slack)
     given = {name: of(state) for name, of in given.items() if of is not None}
     given = {"box": nbrs.box, "cutoff": _cutoffs_of(nbrs)} | given
     while True:
-        after, seen = chunk(state, nbrs)
+        made: Any = chunk(state, nbrs)
+        if not (isinstance(made, tuple) and len(made) == 2 and isinstance(made[1], KeptSearch)):
+            raise TypeError(f"chunk must return the state and the list, got {jax.tree.structure(made)}.")
+        after, seen = made
         with own_transfers():
             overflow = bool(np.any(np.asarray(seen.overflow)))
         if not overflow:
             seen.check()
             return after, seen
         nbrs = seen.grow(positions(state), slack=slack, **given)
+
+
+def _check(chunk: object, nbrs: object, functions: dict[str, Any]) -> None:
+    if not isinstance(nbrs, KeptSearch):
+        raise TypeError(f"nbrs must be a list of jfrnn.search or jfrnn.search_edges, got {type(nbrs).__name__}.")
+    for name, given in {"chunk": chunk, **functions}.items():
+        if not callable(given):
+            raise TypeError(f"{name} must be a function, got {type(given).__name__}.")
 
 
 def _cutoffs_of(nbrs: KeptSearch) -> Array | tuple[Array, Array] | None:

@@ -51,13 +51,13 @@ def check_total(total: object) -> int:
     return int(total)
 
 
-def check_held(held: Array, total: int) -> None:
-    """Raise outside jit if more pairs are held than arrays of this length have room for."""
+def check_held(held: Array, total: int, what: str = "pairs") -> None:
+    """Raise outside jit if more is held than arrays of this length have room for."""
     if isinstance(held, Tracer):
         return
     known = int(np.max(jax.device_get(held)))
     if known > total:
-        raise ValueError(f"total={total} is too small: the list holds {known} pairs. Pass total={known} or more.")
+        raise ValueError(f"total={total} is too small: the list holds {known} {what}. Pass total={known} or more.")
 
 
 def saturating_add(a: Array, b: Array) -> Array:

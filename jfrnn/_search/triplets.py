@@ -41,7 +41,7 @@ def triplets_of(receivers: Array, mask: Array, known: Array, total: int | None, 
             raise TypeError("total must be given inside jax.jit: the length of the arrays, which it cannot read from the edges.")
         total = int(jax.device_get(offsets[-1]))
     room = check_total(total)
-    check_held(offsets[-1], room)
+    check_held(offsets[-1], room, "triplets")
     found = _find(receivers, offsets, room, half)
     return found._replace(triplet_count=jnp.where(known, found.triplet_count, np.iinfo(np.int32).min))
 

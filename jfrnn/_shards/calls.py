@@ -15,7 +15,7 @@ from jfrnn._engine import ENGINES, Features, parse_backend
 from jfrnn._geometry import check_cutoff, check_flag, check_skin, mark_rows
 from jfrnn._search import count, list_radius, round_capacity
 from jfrnn._shards.halo import Halo, exchange, halo_in_shard, halo_spec, rows_seen
-from jfrnn._shards.particles import OVERFLOWS, Particles, of_shards, spec_of
+from jfrnn._shards.particles import OVERFLOWS, Particles, check_particles, of_shards, spec_of
 from jfrnn._tracing import Given, Tree
 
 # The engines that support periodic boxes, which distributed particles may have.
@@ -37,9 +37,8 @@ class Asked(NamedTuple):
         return kind | {"box": particles.box, "active": active}
 
 
-def check_asked(particles: object, cutoff: Given, skin: object, include_self: object, closed: object, backend: Given) -> Asked:
-    if not isinstance(particles, Particles):
-        raise TypeError(f"particles must be what jfrnn.distributed.scatter returns, got {type(particles).__name__}.")
+def check_asked(particles: Particles, cutoff: Given, skin: object, include_self: object, closed: object, backend: Given) -> Asked:
+    check_particles(particles)
     parse_backend(backend, BACKENDS, " on several devices")
     dtype = np.dtype(particles.positions.dtype)
     radius = check_cutoff(cutoff, dtype)
@@ -114,6 +113,7 @@ def halo(particles: Particles) -> Halo:
     Cost: a pass over the shard's particles per shard along an axis of the mesh. Differentiable: no gradient flows through. Jit:
     yes. vmap: no.
     """
+    check_particles(particles)
     return over_shards(halo_in_shard, particles, halo_spec(particles), lax.stop_gradient(particles))
 
 

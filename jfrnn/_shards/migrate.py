@@ -12,7 +12,7 @@ from jax import Array, lax
 from jfrnn._geometry import Status, ordered_bits
 from jfrnn._shards.calls import over_shards
 from jfrnn._shards.halo import halo_in_shard
-from jfrnn._shards.particles import Particles, spec_of
+from jfrnn._shards.particles import Particles, check_particles, spec_of
 from jfrnn._tracing import Tree, set_places
 
 _DIGIT = 2  # bits of a bound per round of counting
@@ -37,6 +37,7 @@ def migrate(particles: Particles) -> Particles:
     gradient flows through. Jit: yes. vmap: no. Source: bounds by counting (Warren & Salmon 1993, doi:10.1145/169627.169640), found
     digit by digit.
     """
+    check_particles(particles)
     return over_shards(_migrate_shard, particles, spec_of(particles), lax.stop_gradient(particles))
 
 

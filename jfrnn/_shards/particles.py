@@ -17,7 +17,7 @@ from jax import Array, lax
 from jax.core import Tracer
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
-from jfrnn._geometry import Box, Status, check_again, check_values, names_of_bits, shape_of
+from jfrnn._geometry import Box, Status, check_again, check_slack, check_values, names_of_bits, shape_of
 from jfrnn._tracing import Given, Tree
 
 OVERFLOWS = Status.ROW_OVERFLOW | Status.SHARD_OVERFLOW | Status.HALO_OVERFLOW | Status.HALO_TOO_FAR
@@ -165,8 +165,11 @@ class Particles:
         """
         if any(isinstance(x, Tracer) for x in jax.tree.leaves(self)):
             raise TypeError("grow() changes shapes and cannot run inside jax.jit: call it on what jit returns.")
+        for met in seen:
+            if not isinstance(getattr(met, "required", None), Required):
+                raise TypeError(f"seen must be particles, lists or halos of jfrnn.distributed, got {type(met).__name__}.")
         required = functools.reduce(Required.join, (met.required for met in seen), self.required)
-        return resize(self, _enough(self.sizes, required, self.mesh, slack))
+        return resize(self, _enough(self.sizes, required, self.mesh, check_slack(slack)))
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Return how to unpickle the particles on devices of the same numbers; a mesh itself cannot be pickled."""
@@ -228,6 +231,13 @@ def no_requirements(axes: int) -> Required:
     none: Any = np.zeros((), np.int32)
     each: Any = np.zeros(axes, np.int32)
     return Required(none, each, each, none)
+
+
+def check_particles(particles: object) -> None:
+    """Refuse what are no particles of this module."""
+    if not isinstance(particles, Particles):
+        came = "an array" if isinstance(particles, Array | np.ndarray) else type(particles).__name__
+        raise TypeError(f"particles must be what jfrnn.distributed.scatter returns, got {came}.")
 
 
 def of_shards(mesh: Mesh) -> PartitionSpec:

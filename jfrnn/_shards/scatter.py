@@ -13,7 +13,7 @@ from jax.sharding import Mesh
 from jfrnn._geometry import Box, check_box, check_cutoff, check_positions, check_skin, check_slack, check_values, images_of
 from jfrnn._search import list_radius
 from jfrnn._shards.migrate import migrate
-from jfrnn._shards.particles import Particles, Sizes, no_requirements, place_rows, replicate, resize, room
+from jfrnn._shards.particles import Particles, Sizes, check_particles, no_requirements, place_rows, replicate, resize, room
 from jfrnn._tracing import Number, Points, Real, Tree, as_array
 
 _MOST = 2**31 - 1
@@ -55,7 +55,9 @@ def scatter(
     if any(isinstance(x, Tracer) for x in jax.tree.leaves((positions, values, box))):
         raise TypeError("scatter() chooses shapes from data and cannot run inside jax.jit: call it before, on arrays.")
     positions = as_array("positions", positions, float)
-    check_positions("positions", positions[:0] if hasattr(positions, "shape") and np.ndim(positions) else positions)
+    if (shape := np.shape(positions))[1:] not in ((2,), (3,)):
+        raise ValueError(f"positions must have shape [n, 2] or [n, 3], got {list(shape)}.")
+    check_positions("positions", positions[:0])
     x = np.asarray(positions)
     if len(x) > _MOST:
         raise ValueError(f"positions hold {len(x)} particles, but ids are int32: at most {_MOST}.")
@@ -104,6 +106,7 @@ def collect(particles: Particles) -> tuple[np.ndarray, Any]:
 
     Communication: every process gets everything; meant for checks and pictures. Differentiable: no. Jit: no.
     """
+    check_particles(particles)
     if isinstance(particles.ids, Tracer):
         raise TypeError("collect() makes host arrays and cannot run inside jax.jit: call it on what jit returns.")
     ids = fetch(particles.ids)
@@ -135,8 +138,9 @@ def _check_along(along: Sequence[int] | None, x: np.ndarray, mesh: Mesh) -> tupl
         finite = x[np.isfinite(x).all(axis=1)]
         extent = np.ptp(finite, axis=0) if len(finite) else np.zeros(dim)
         return tuple(np.argsort(-extent, kind="stable")[:axes].tolist())
-    given = tuple(along)
-    if len(given) != axes or len(set(given)) != axes or not set(given) <= set(range(dim)):
+    given = tuple(along) if isinstance(along, Sequence) else (along,)
+    known = {axis for axis in given if type(axis) is int}
+    if not len(given) == len(known) == axes or not known <= set(range(dim)):
         raise ValueError(
             f"along must name {axes} different axes of space, of 0 to {dim - 1}, one per axis of the mesh, got {given}."
         )

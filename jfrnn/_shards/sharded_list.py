@@ -12,12 +12,12 @@ from jax import Array, lax
 from jax.core import Tracer
 from jax.sharding import PartitionSpec
 
-from jfrnn._geometry import check_devices, pairs_and_status, shape_of
+from jfrnn._geometry import check_devices, check_slack, pairs_and_status, shape_of
 from jfrnn._search import NeighborList, has_moved_too_far, round_capacity, search
 from jfrnn._shards.calls import Asked, check_halo, count_capacity, gather_seen, over_shards
 from jfrnn._shards.halo import Halo, halo_in_shard, halo_spec
 from jfrnn._shards.migrate import migrate
-from jfrnn._shards.particles import OVERFLOWS, Particles, Required, check, of_shards, share_bits, share_largest
+from jfrnn._shards.particles import OVERFLOWS, Particles, Required, check, check_particles, of_shards, share_bits, share_largest
 from jfrnn._shards.scatter import fetch
 
 
@@ -105,7 +105,7 @@ class Neighbors:
         self._check_kind(particles)
         if any(isinstance(x, Tracer) for x in jax.tree.leaves((particles, self.required))):
             raise TypeError("grow() changes shapes and cannot run inside jax.jit: call it on what jit returns.")
-        counted = count_capacity(particles, self.asked, slack)
+        counted = count_capacity(particles, self.asked, slack := check_slack(slack))
         met = round_capacity(math.ceil(slack * int(self.required.row))) if int(self.required.row) > self.capacity else 0
         return list_on_shards(particles, self.asked, max(self.capacity, counted, met))
 
@@ -118,10 +118,9 @@ class Neighbors:
         """
         check(self, f"row {self.capacity}, halo {[sends.shape[1] for sends in self.halo.sends]}")
 
-    def _check_kind(self, particles: object) -> None:
+    def _check_kind(self, particles: Particles) -> None:
         """Raise for particles of another dtype or dimension, in another kind of box, or on other devices than those of the list."""
-        if not isinstance(particles, Particles):
-            raise TypeError(f"particles must be what jfrnn.distributed.scatter returns, got {type(particles).__name__}.")
+        check_particles(particles)
         check_devices("particles", particles.ids, self.count)
         made, came = (
             f"{dtype}, {dim}D, {'in open space' if box is None else f'box with periodic={box.periodic}'}"

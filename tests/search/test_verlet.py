@@ -212,6 +212,10 @@ def test_a_chunk_is_replayed_until_its_list_was_large_enough():
     once, _ = squeeze(x, nbrs)
     np.testing.assert_array_equal(once, end)
     refuses(TypeError, "jit the chunk, not the loop", jax.jit(lambda x: jfrnn.run_chunk(squeeze, x, nbrs, lambda x: x)[0]), x)
+    refuses(TypeError, "nbrs must be a list of jfrnn.search or .*, got int", jfrnn.run_chunk, squeeze, x, 5, lambda x: x)
+    refuses(TypeError, "positions must be a function, got int", jfrnn.run_chunk, squeeze, x, nbrs, 5)
+    refuses(TypeError, "chunk must return the state and the list", jfrnn.run_chunk, lambda x, nbrs: x, x, nbrs, lambda x: x)
+    refuses(ValueError, "slack must be finite and at least 1", jfrnn.run_chunk, squeeze, x, nbrs, lambda x: x, slack=0.1)
 
 
 @pytest.mark.parametrize(
