@@ -128,7 +128,10 @@ def memory_plan(
     radius = make_cutoff(check_cutoff(cutoff, dtype), dtype, closed=False)
     rows, gradient = n if queries is None else queries, check_flag("gradient", gradient)
     where = engine.default_platform() if platform is None else platform
+    skin, reverse = check_skin(skin, float(radius.radius), dtype), check_flag("reverse", reverse)
     _check_parts(faces, queries, fn, capacity, gradient or values is not None)
+    if (skin or reverse) and (faces is not None or fn is not None or (capacity is None and total is None)):
+        raise ValueError("skin and reverse are those of a list: say its capacity or total, or leave them out.")
     if total is not None and not (faces is None and fn is None and capacity is None):
         raise ValueError("total is that of a flat list, which has no capacity, no faces and no fn: leave them out.")
     if faces is not None:
@@ -154,8 +157,7 @@ def memory_plan(
             scratch += 4 * total  # XLA writes one of the two arrays anew
     if capacity is None and total is None:
         return MemoryPlan(0, scratch, chosen.name, counts_bytes=4 * rows)
-    kept = (n + (queries or 0)) * dim * dtype.itemsize + 4 if check_skin(skin, float(radius.radius), dtype) else 0
-    reverse = check_flag("reverse", reverse)
+    kept = (n + (queries or 0)) * dim * dtype.itemsize + 4 if skin else 0
     if total is not None:
         kept += 4 * total + 8 * n if reverse else 0
         return MemoryPlan(8 * total + 4 * (rows + 1) + 8 + kept, scratch, chosen.name)

@@ -85,7 +85,8 @@ def _cells_from_lowest(x: Array, size: Array, finite: Array) -> list[Array]:
     x = jnp.where(finite, x, 0)
     largest = jnp.max(jnp.abs(x), axis=1, initial=0)
     ahead = jnp.maximum(_exponent(largest) - _exponent(size) - _DISTINCT, 0)
-    cells = jnp.floor(x / _times_power_of_two(size, ahead)[:, None])
+    edge = jnp.broadcast_to(_times_power_of_two(size, ahead)[:, None], x.shape)
+    cells = jnp.floor(x / lax.optimization_barrier(edge))  # by one number, XLA would multiply with its rounded reciprocal
     cells = jnp.where(x < 0, jnp.minimum(cells, -1), cells)  # otherwise a quotient that underflows would be in cell 0
     lowest = jnp.min(cells, axis=1, initial=jnp.inf, where=finite)
     span = jnp.max(cells, axis=1, initial=-jnp.inf, where=finite) - lowest  # -inf if there is no particle

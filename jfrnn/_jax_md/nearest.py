@@ -148,7 +148,7 @@ def neighbor_list(
             raise TypeError(f"position must hold floats, got {position.dtype}.")
         if not bool(jnp.isfinite(position).all()):
             at = int(jnp.argmin(jnp.isfinite(position).all(axis=1)))
-            raise ValueError(f"position must be finite, got {position[at]} of particle {at}.")
+            raise ValueError(f"position holds non-finite coordinates, {position[at]} of particle {at}.")
         n, dim = position.shape
         space = own_space(dim)
         exact = space is not None and space.fractional == fractional_coordinates and not _DEFORM & kwargs.keys()

@@ -29,7 +29,7 @@ def with_particles(scene: Scene, path: Path | str) -> Scene:
         raise SceneError(f"initial {path}: says nothing of thermal energies, which scene {scene.name!r} needs; leave it out")
     arrays = _read(Path(path), scene.dim)
     try:
-        given = {name: np.asarray(array, np.float64) for name, array in arrays.items()}
+        given = {name: np.asarray(array).astype(np.float64, casting="same_kind") for name, array in arrays.items()}
     except (TypeError, ValueError) as error:
         raise SceneError(f"{path}: holds what are no numbers: {error}") from error
     positions = given["positions"]
@@ -125,6 +125,8 @@ def _read(path: Path, dim: int) -> dict[str, np.ndarray]:
             with path.open("rb") as stream, np.load(stream) as file:
                 given = {key: file[key] for key in file}
         else:
+            if not path.read_bytes().strip():
+                raise ValueError("it is empty")
             table = np.atleast_1d(np.genfromtxt(path, delimiter=",", names=True, dtype=np.float64))
             given = _columns(table, "xyz"[:dim])
     except OSError as error:

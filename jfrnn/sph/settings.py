@@ -71,7 +71,7 @@ def _value(scene: str, key: str, text: str, kind: Any) -> Any:  # noqa: ANN401
     except ValueError:
         value = None if text.lower() == "none" else text
     try:
-        return ranges.read(kind, value, ranges.of(scene, key))
+        return ranges.read(kind, value, ranges.of(scene, key), strict=isinstance(value, bool))
     except ValueError as error:
         raise SceneError(f"--set {key}: got {text!r}; {error}") from error
 

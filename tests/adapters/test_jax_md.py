@@ -185,7 +185,7 @@ def test_positions_that_are_not_finite_are_told(measured):
     lost = x.copy()
     lost[3] = np.nan
     fns = jax_md.neighbor_list(free, LENGTHS, CUTOFF, SKIN, disable_cell_list=measured)
-    refuses(ValueError, "position must be finite, got .* of particle 3", fns.allocate, lost)
+    refuses(ValueError, "position holds non-finite coordinates, .* of particle 3", fns.allocate, lost)
     nbrs = fns.allocate(x)
     assert not fns.update(x, nbrs).did_buffer_overflow
     assert fns.update(lost, nbrs).did_buffer_overflow

@@ -285,6 +285,15 @@ def test_order_without_x64_is_the_same(any_curve):
             np.testing.assert_array_equal(wide, expected_order(cells, any_curve))
 
 
+def test_cells_are_those_of_the_rounded_quotient():
+    """Not of a product with a reciprocal, which rounds twice, and of a large cell size is 0."""
+    x = (np.random.default_rng(1).normal(size=(400, 2)) * 10 + 1e5).astype(np.float32)
+    far = np.array([[3e38, 0], [-3e38, 0], [1.5e38, 0], [0, 0]], np.float32)
+    for points, size in ((x, 0.01), (x, 0.001), (x, 0.3), (far, 1e38)):
+        cells = np.floor(points / np.float32(size))
+        np.testing.assert_array_equal(sort_order(points, size, curve="row"), np.lexsort((cells[:, 0], cells[:, 1])))
+
+
 @pytest.mark.parametrize("excess", [0, 1, 5])
 @pytest.mark.parametrize(("any_curve", "dim"), [("row", 2), ("morton", 2), ("hilbert", 2), ("hilbert", 3)])
 def test_too_many_cells_are_merged_by_the_smallest_power_of_two(any_curve, excess, dim):

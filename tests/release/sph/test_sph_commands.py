@@ -95,6 +95,7 @@ def test_every_number_that_can_be_set_has_a_range_and_defaults_are_within():
         ("jet", "duration=1e-9", "scene 'jet' --set duration=1e-9: wall: there is no particle of fluid"),
         ("jet", "duration=1e300", "scene 'jet' --set duration=1e300: cannot be made ("),
         ("jet-gear", "teeth=4", "--set teeth: got '4'; input should be greater than or equal to 5 (from 5 to 1 000)"),
+        ("jet-gear", "teeth=true", "--set teeth: got 'true'; input should be a valid integer (from 5 to 1 000)"),
         ("one", "restitution=none", "scene 'one': restitution must be a number from 0 to 1 in a tank, got None"),
         ("taylor-green", "nx=4", "scene 'taylor-green': periodic box must be 2.05 cutoffs wide along x"),
     ],
@@ -123,6 +124,7 @@ def test_no_number_of_a_scene_ends_in_anything_but_a_sentence(name):
         ("text.npz", b"no archive", "{}: cannot be read: "),
         ("cut.npz", b"PK\x03\x04 cut", "{}: cannot be read: "),
         ("empty.npz", b"", "{}: cannot be read: "),
+        ("empty.csv", b"\n", "{}: cannot be read: it is empty"),
         ("words.csv", b"x,y\n1,a\n", "{}: positions must be finite; particle 0 is not"),
         ("masses.csv", b"x,y,m\n1,1,0\n", "{}: expected at least one particle, and masses above 0"),
     ],
@@ -135,9 +137,10 @@ def test_particles_that_cannot_be_used(tmp_path, name, content, message):
     assert not (tmp_path / "out").exists()
 
 
-def test_arrays_of_words_are_no_particles(tmp_path):
+@pytest.mark.parametrize("positions", [np.array([["a", "b"]]), np.ones((5, 2)) + 1j])
+def test_arrays_of_words_are_no_particles(tmp_path, positions):
     path = tmp_path / "words.npz"
-    np.savez(path, positions=np.array([["a", "b"]]))
+    np.savez(path, positions=positions)
     assert refused("run", "dam", "--initial", path).startswith(f"{path}: holds what are no numbers: ")
 
 

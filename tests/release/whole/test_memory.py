@@ -307,6 +307,8 @@ def test_the_plan_reads_well():
         (TypeError, r"capacity must be a static int", {"capacity": 8.0}),
         (ValueError, r"capacity is that of a list.*got 8", {"fn": density}),
         (ValueError, r"values and gradient belong to a pair sum", {"gradient": True}),
+        (ValueError, r"skin and reverse are those of a list", {"capacity": None, "skin": 0.1}),
+        (ValueError, r"skin and reverse are those of a list", {"faces": 4, "reverse": True}),
         (ValueError, r"dim must be 2 or 3, got int 4", {"dim": 4}),
         (TypeError, r"dtype must be float32 or float64, got int64", {"dtype": np.int64}),
         (ValueError, r"backend must be one of 'auto', 'jax', 'warp', 'hashgrid', 'brute', got 'cuda'", {"backend": "cuda"}),
