@@ -450,7 +450,8 @@ def wrong_arguments_are_named():
     raises(ValueError, "[n, 2] or [n, 3], got [300, 4]", distributed.scatter, np.zeros((300, 4)), 0.1, mesh=mesh)
     for along in ("x", [True], [0.0], [2]):
         raises(ValueError, "along must name 1 different axes", distributed.scatter, x, 0.1, mesh=mesh, along=along)
-    particles = distributed.scatter(x, 0.1, mesh=mesh)
+    particles = distributed.scatter(x, 0.1, mesh=mesh, along=np.array([1]))
+    assert particles.along == (1,)
     for slack in (0.1, np.nan):
         raises(ValueError, "slack must be finite and at least 1", particles.grow, slack=slack)
     raises(TypeError, "seen must be particles, lists or halos of jfrnn.distributed, got int", particles.grow, 5)

@@ -88,7 +88,7 @@ def neighbor_list(
     """
     form, cutoff, skin = check_format(format), float(r_cutoff), float(dr_threshold)
     reach = cutoff + skin
-    if not (0 < cutoff < np.inf and 0 <= skin < np.inf):
+    if not (cutoff > 0 and (cutoff < np.inf or disable_cell_list) and 0 <= skin < np.inf):  # jax-md measures all pairs within inf
         raise ValueError(f"r_cutoff must be finite and above 0, and dr_threshold finite and not below 0, got {cutoff} and {skin}.")
 
     def own_space(dim: int) -> Space | None:
@@ -146,8 +146,9 @@ def neighbor_list(
             )
         if not jnp.issubdtype(position.dtype, jnp.floating):
             raise TypeError(f"position must hold floats, got {position.dtype}.")
-        if not bool(jnp.isfinite(position).all()):
-            at = int(jnp.argmin(jnp.isfinite(position).all(axis=1)))
+        finite = jnp.isfinite(position).all(axis=1)
+        if not bool(finite.all()):
+            at = int(jnp.argmin(finite))
             raise ValueError(f"position holds non-finite coordinates, {position[at]} of particle {at}.")
         n, dim = position.shape
         space = own_space(dim)

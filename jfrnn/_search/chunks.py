@@ -76,7 +76,7 @@ def run_chunk(
     given = {"box": nbrs.box, "cutoff": _cutoffs_of(nbrs)} | given
     while True:
         made: Any = chunk(state, nbrs)
-        if not (isinstance(made, tuple) and len(made) == 2 and isinstance(made[1], KeptSearch)):
+        if not (isinstance(made, tuple | list) and len(made) == 2 and isinstance(made[1], KeptSearch)):
             raise TypeError(f"chunk must return the state and the list, got {jax.tree.structure(made)}.")
         after, seen = made
         with own_transfers():

@@ -138,13 +138,13 @@ def _check_along(along: Sequence[int] | None, x: np.ndarray, mesh: Mesh) -> tupl
         finite = x[np.isfinite(x).all(axis=1)]
         extent = np.ptp(finite, axis=0) if len(finite) else np.zeros(dim)
         return tuple(np.argsort(-extent, kind="stable")[:axes].tolist())
-    given = tuple(along) if isinstance(along, Sequence) else (along,)
-    known = {axis for axis in given if type(axis) is int}
+    given = tuple(along) if np.iterable(along) else (along,)
+    known = {int(axis) for axis in given if isinstance(axis, int | np.integer) and not isinstance(axis, bool)}
     if not len(given) == len(known) == axes or not known <= set(range(dim)):
         raise ValueError(
             f"along must name {axes} different axes of space, of 0 to {dim - 1}, one per axis of the mesh, got {given}."
         )
-    return given
+    return tuple(map(int, given))
 
 
 def _check_box(box: object, x: np.ndarray, reach: float, mesh: Mesh) -> Box | None:

@@ -84,9 +84,9 @@ def pseudonormals(
     The pseudonormal of a face is its normal, that of a side the sum of the normals of the faces sharing it, and that of a vertex
     the sum over the faces around it, weighted with their angles; in 2D a vertex has the sum of both segments. All these faces are
     equally near, so they are in the same row. Where normals cancel, as those of parts that touch, it is that of the nearest face.
-    Faces [f, corner] int32 run counterclockwise as seen from outside, so do segments
-    around what they enclose; their corners are [f, corner, d], and those that are valid `good` [f].
-    Rows idx [n, capacity] have so many slots `used` [n]; the nearest point of each lies on a `feature` [n] of a `triangle` [n].
+    Faces [f, corner] int32 run counterclockwise as seen from outside, so do segments around what they enclose; their corners are
+    [f, corner, d], and those that are valid `good` [f]. Rows idx [n, capacity] have so many slots `used` [n]; the nearest point of
+    each lies on a `feature` [n] of a `triangle` [n].
     Source: Baerentzen & Aanaes (2005), doi:10.1109/TVCG.2005.49.
     """
     n, capacity = idx.shape

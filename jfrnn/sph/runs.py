@@ -209,19 +209,18 @@ class _Writer:
 
     def line(self, s: State, step: int) -> dict[str, float]:
         """Add a line to each table, and return the energies."""
-        self._line = snapshots.energies(self._model, s, self._scene)
         for name, line in self._tables(s).items():
             snapshots.add_line(line, self._folder / name, step)
         return self._line
 
     def check(self, s: State) -> None:
         """Refuse to go on with tables of other columns."""
-        self._line = snapshots.energies(self._model, s, self._scene)
         for name, line in self._tables(s).items():
             snapshots.check_columns(line, self._folder / name)
 
     def _tables(self, s: State) -> dict[str, dict[str, float]]:
-        """Return a line of each table, by its file: numbers by the heads of their columns."""
+        """Return a line of each table, by its file: numbers by the heads of their columns. The energies are kept."""
+        self._line = snapshots.energies(self._model, s, self._scene)
         tables = {"energies.csv": {snapshots.head(name, s.x.shape[1]): value for name, value in self._line.items()}}
         if self._probe is None:
             return tables

@@ -187,6 +187,8 @@ def test_positions_that_are_not_finite_are_told(measured):
     fns = jax_md.neighbor_list(free, LENGTHS, CUTOFF, SKIN, disable_cell_list=measured)
     refuses(ValueError, "position holds non-finite coordinates, .* of particle 3", fns.allocate, lost)
     nbrs = fns.allocate(x)
+    every = jax_md.neighbor_list(free, LENGTHS, np.inf, disable_cell_list=True).allocate(x)
+    assert (every.idx < 20).sum() == 20 * 19
     assert not fns.update(x, nbrs).did_buffer_overflow
     assert fns.update(lost, nbrs).did_buffer_overflow
 

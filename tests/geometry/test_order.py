@@ -286,7 +286,7 @@ def test_order_without_x64_is_the_same(any_curve):
 
 
 def test_cells_are_those_of_the_rounded_quotient():
-    """Not of a product with a reciprocal, which rounds twice, and of a large cell size is 0."""
+    """A product with the reciprocal rounds twice, and the reciprocal of a large cell size is flushed to 0."""
     x = (np.random.default_rng(1).normal(size=(400, 2)) * 10 + 1e5).astype(np.float32)
     far = np.array([[3e38, 0], [-3e38, 0], [1.5e38, 0], [0, 0]], np.float32)
     for points, size in ((x, 0.01), (x, 0.001), (x, 0.3), (far, 1e38)):

@@ -145,7 +145,7 @@ def test_few_cutoffs_much_longer_than_the_rest(dtype, dim, apart):
 
 
 def test_few_cutoffs_much_longer_than_those_of_many():
-    """So many that CUDA serves their queries in more blocks than one each."""
+    """Among so many particles, CUDA serves blocks of queries in parts: the few still find what is marked for them."""
     random = np.random.default_rng(2)
     x, cutoffs = random.random((20_000, 3)).astype(np.float32), np.full(20_000, 0.03, np.float32)
     cutoffs[random.permutation(20_000)[:12]] = 0.25
