@@ -35,7 +35,8 @@ def jitter(domain: Domain, *, fill: float = 0.11, amplitude: float = 0.5, seed: 
     """Return a box of sites in the middle of the domain, each displaced at random.
 
     The box takes fill^(1/dim) of every axis, rounded to the nearest site. A displacement is uniform in
-    [0, amplitude · spacing) along each axis, so that points keep to the domain and to the cell of their site.
+    [0, amplitude · spacing) along each axis, or less where the domain ends sooner, so that points keep to the domain and to the
+    cell of their site.
 
     Args:
         domain: The domain.
@@ -51,7 +52,8 @@ def jitter(domain: Domain, *, fill: float = 0.11, amplitude: float = 0.5, seed: 
         ValueError: An argument is out of range.
     """
     positions = clusters(domain, 1, fill=fill)
-    reach = fraction("amplitude", amplitude) * domain.spacing
+    reach, room = fraction("amplitude", amplitude), np.asarray(domain.lengths) - positions
+    reach = reach * np.where(room < domain.spacing * (1 - 1e-9), room, domain.spacing)
     return positions + reach * _generator(seed).random(positions.shape)
 
 

@@ -10,8 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from jfrnn._ase import check_number, half_of, primitive_neighbor_list
-from jfrnn._ase import neighbor_list as ase_neighbor_list
+from jfrnn._ase import check_number, half_of, neighbor_list, primitive_neighbor_list
 
 __all__ = ["NeighborList", "ase_neighbor_list"]
 
@@ -60,7 +59,7 @@ class NeighborList:
             copy: Not used: what is returned is the caller's.
 
         Returns:
-            A tuple of arrays: i, j and P uint64, S int32, D and d float64.
+            A tuple of arrays: i, j and P uint64, S int32, D and d as points are, float32 or else float64.
 
         Raises:
             TypeError, ValueError: an argument is of the wrong kind, shape or range.
@@ -77,4 +76,11 @@ class NeighborList:
             used = half_of(found["i"], found["j"], found["S"])
             found = {name: x[used] for name, x in found.items()}
         found["P"] = np.stack([found["i"], found["j"]], axis=1)
-        return tuple(found[name].astype(_DTYPES.get(name, np.float64), copy=False) for name in quantities)
+        real = np.float32 if getattr(points, "dtype", None) == np.float32 else np.float64
+        return tuple(found[name].astype(_DTYPES.get(name, real), copy=False) for name in quantities)
+
+
+def ase_neighbor_list(quantities: str, *args: Given, **kwargs: Given) -> tuple[np.ndarray, ...]:
+    """Find pairs as `jfrnn.ase.neighbor_list` does, with the same arguments; the result is a tuple, of one letter, too."""
+    found = neighbor_list(quantities, *args, **kwargs)
+    return found if isinstance(found, tuple) else (found,)

@@ -38,12 +38,12 @@ class PrimitiveNeighborList(theirs.NewPrimitiveNeighborList):
     @property
     def neighbors(self) -> list[np.ndarray]:
         """Neighbors of each atom."""
-        return np.split(self.pair_second, self.first_neigh[1:-1])
+        return np.split(self.pair_second, self.first_neigh[1:-1])[: len(self.positions)]
 
     @property
     def displacements(self) -> list[np.ndarray]:
         """By how many lattice vectors the neighbors of each atom are moved."""
-        return np.split(self.offset_vec, self.first_neigh[1:-1])
+        return np.split(self.offset_vec, self.first_neigh[1:-1])[: len(self.positions)]
 
 
 NewPrimitiveNeighborList = PrimitiveNeighborList

@@ -45,7 +45,7 @@ def neighbor_list(
             periodic may be anything, also 0. Atoms may lie outside the cell, which may have any skew or handedness.
         cutoff: A number [length]; or a dictionary of cutoffs of pairs of species, {("H", "O"): 1.2, (6, 6): 2.0}, in which absent
             pairs have none; or radii of all atoms, an array [n]: pairs are then closer than the sum of their radii.
-        self_interaction: List each atom as its own neighbor, with S = 0.
+        self_interaction: List each atom as its own neighbor, with S = 0, where a pair of its kind may be neighbors at all.
         max_nbins: Not used; it stands here as ASE has it.
         atoms: The name that matscipy has for a.
         positions: In place of atoms: positions [length], shape [n, 3].

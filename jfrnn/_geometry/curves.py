@@ -296,8 +296,11 @@ def _check_range(name: str, values: Given, limit: int, advice: str) -> None:
     """Raise for concrete integers outside [0, limit), before a conversion could drop their high bits."""
     if isinstance(values, Tracer) or not values.size:
         return
-    with at_once(), own_transfers():  # also evaluates concrete values inside jit
-        low, high = (int(x) for x in _range(values))
+    if isinstance(values, np.ndarray):  # a program would have 32 bits of it
+        low, high = int(values.min()), int(values.max())
+    else:
+        with at_once(), own_transfers():  # also evaluates concrete values inside jit
+            low, high = (int(x) for x in _range(values))
     if not 0 <= low <= high < limit:
         raise ValueError(f"{name} must be in [0, {limit}), got values from {low} to {high}: {advice}.")
 

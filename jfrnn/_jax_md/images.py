@@ -134,13 +134,20 @@ def neighbor_list_multi_image(  # noqa: D417 (four arguments share a line)
         if not isinstance(neighbors, NeighborListMultiImage):  # jax-md's own
             return neighbors.update(position, **{} if box is None else {"box": box})
         position, room, old = jnp.asarray(position), neighbors.max_occupancy, neighbors.kept
-        matrix, made = box_of(neighbors.box if box is None else box, position.shape[1], old.box)
-        kept = old.update(position, box=made)
+        others = neighbors.update_fn is not update and getattr(neighbors.update_fn, "settings", None) != settings
+        if others and neighbors.format != form:
+            raise ValueError(f"update() of format {form.name} was given a list of format {neighbors.format.name}: allocate anew.")
+        matrix, made = box_of(neighbors.box if box is None else box, position.shape[1], None if others else old.box)
+        kept = (
+            old.update(position, box=made) if not others else search(position, cutoff, box=made, skin=skin, capacity=old.capacity)
+        )
         idx, shifts, held = finish(kept, position, made, room)
-        moved = jnp.asarray(True) if skin == 0 else kept.rebuild_count != old.rebuild_count
+        moved = jnp.asarray(True) if skin == 0 or others else kept.rebuild_count != old.rebuild_count
         reference = jnp.where(moved, position, neighbors.reference_position)
         reference_box = jnp.where(moved, matrix, neighbors.reference_box)
         overflow = neighbors.did_buffer_overflow | (held > room) | (kept.status != 0)
         return made_of((idx, shifts, reference, reference_box, matrix), overflow, kept, room)
 
+    settings = cutoff, skin, form, fractional_coordinates, None if pbc is None else np.asarray(pbc).tolist()
+    update.settings = settings  # pyright: ignore[reportFunctionMemberAccess]
     return custom_partition.NeighborListMultiImageFns(allocate, update)

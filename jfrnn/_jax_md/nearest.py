@@ -88,8 +88,8 @@ def neighbor_list(
     """
     form, cutoff, skin = check_format(format), float(r_cutoff), float(dr_threshold)
     reach = cutoff + skin
-    if not (cutoff > 0 and (cutoff < np.inf or disable_cell_list) and 0 <= skin < np.inf):  # jax-md measures all pairs within inf
-        raise ValueError(f"r_cutoff must be finite and above 0, and dr_threshold finite and not below 0, got {cutoff} and {skin}.")
+    if not (cutoff > 0 and 0 <= skin < np.inf):
+        raise ValueError(f"r_cutoff must be above 0, and dr_threshold finite and not below 0, got {cutoff} and {skin}.")
 
     def own_space(dim: int) -> Space | None:
         return Space(box, fractional_coordinates) if displacement_or_metric is None else space_of(displacement_or_metric, dim)
@@ -138,6 +138,39 @@ def neighbor_list(
         near = near & (rows != own[:, None]) if mask_self else near
         return jnp.where(near, rows, n)
 
+    def find(position: Array, kwargs: dict[str, Given], **options: Given) -> tuple[Kept | None, bool]:
+        """Return a list of jfrnn, or None where all pairs are measured, and whether the pairs are decided by it alone."""
+        dim = position.shape[1]
+        space = own_space(dim)
+        exact = space is not None and space.fractional == fractional_coordinates and not _DEFORM & kwargs.keys()
+        exact = exact and (fractional_coordinates or "box" not in kwargs)
+        if space is None or not exact:  # what jax-md promises to look at: cubes of cells as wide as the cutoff
+            space = Space(kwargs.get("box", box), fractional_coordinates)
+        elif "box" in kwargs:
+            space = Space(kwargs["box"], True)
+        radius = cutoff if exact else max(reach * dim**0.5 - skin, reach)
+        if dim not in (2, 3) or position.dtype not in (np.float32, np.float64) or disable_cell_list or cutoff == np.inf:
+            return None, False
+        within = _box_of(space, dim)
+        if within is not None and not isinstance(within.vectors, Tracer) and any(within.images_for(radius + skin)):
+            return None, False  # a list of jax-md holds the nearest image alone
+        kept = search(position, radius, skin=skin, include_self=not mask_self, box=within, **options)
+        return kept, exact
+
+    def find_anew(position: Array, neighbors: NeighborList, kwargs: dict[str, Given]) -> NeighborList:
+        """Find the neighbors of a list that other functions made, which know other cutoffs, boxes or displacements."""
+        if neighbors.format != form:
+            raise ValueError(f"update() of format {form.name} was given a list of format {neighbors.format.name}: allocate anew.")
+        room, n = neighbors.max_occupancy, len(position)
+        most = neighbors.kept.capacity if neighbors.kept is not None else room if form is Dense else max(n - mask_self, 1)
+        kept, exact = find(position, kwargs, capacity=max(most, 1))
+        idx, held = finish(rows_of(position, kept, exact, kwargs), room, exact)
+        status = jnp.where(jnp.isfinite(position).all(), 0, Status.NONFINITE.value) if kept is None else kept.status
+        code = neighbors.error.code | jnp.where(held > room, 1, 0).astype(jnp.uint8) | _code_of(status)
+        fixed = (partition.PartitionError(code), None, room, form, None, None, update)
+        chosen = {"occupancy": held, "measured_in": _matrix_of(kwargs.get("box", jnp.nan), position), "exact": exact}
+        return NeighborList(idx, position, *fixed, kept=kept, **chosen)
+
     def allocate(position: Array, extra_capacity: int = 0, **kwargs: Given) -> NeighborList:
         position = jnp.asarray(position)
         if isinstance(position, Tracer):
@@ -150,30 +183,18 @@ def neighbor_list(
         if not bool(finite.all()):
             at = int(jnp.argmin(finite))
             raise ValueError(f"position holds non-finite coordinates, {position[at]} of particle {at}.")
-        n, dim = position.shape
-        space = own_space(dim)
-        exact = space is not None and space.fractional == fractional_coordinates and not _DEFORM & kwargs.keys()
-        exact = exact and (fractional_coordinates or "box" not in kwargs)
-        if space is None or not exact:  # what jax-md promises to look at: cubes of cells as wide as the cutoff
-            space = Space(kwargs.get("box", box), fractional_coordinates)
-        elif "box" in kwargs:
-            space = Space(kwargs["box"], True)
-        radius, kept = cutoff if exact else max(reach * dim**0.5 - skin, reach), None
-        given = {"skin": skin, "include_self": not mask_self}
-        if dim in (2, 3) and position.dtype in (np.float32, np.float64) and not disable_cell_list:
-            given |= {"box": _box_of(space, dim)}
-            kept = search(position, radius, slack=max(float(capacity_multiplier), 1.0), **given)
+        n = len(position)
+        kept, exact = find(position, kwargs, slack=max(float(capacity_multiplier), 1.0))
+        if kept is not None:
             kept.check()
-            kept = kept if kept.images is None else None  # a list of jax-md holds the nearest image alone
-        exact = exact and kept is not None
         rows = rows_of(position, kept, exact, kwargs)
         occupancy = int(finish(rows, 0, exact)[1])
         most = {Dense: n - mask_self, Sparse: n * (n - mask_self), OrderedSparse: n * (n - 1) // 2}[form]
         extra = extra_capacity if form is Dense else n * extra_capacity
         room = max(min(int(occupancy * capacity_multiplier + extra), most), 0)
         if kept is not None and exact and form is Dense and room > kept.capacity:
-            kept = search(position, radius, capacity=room, **given)
-            rows = kept.idx
+            kept, _ = find(position, kwargs, capacity=room)
+            rows = rows_of(position, kept, exact, kwargs)
         idx, held = finish(rows, room, exact)
         error = partition.PartitionError(jnp.where(held > room, 1, 0).astype(jnp.uint8))
         fixed = (None, room, form, None, None, update)
@@ -183,6 +204,8 @@ def neighbor_list(
     def update(position: Array, neighbors: NeighborList, **kwargs: Given) -> NeighborList:
         if "box" in kwargs and not (fractional_coordinates or disable_cell_list):
             raise ValueError("a list takes box= only with fractional_coordinates=True or disable_cell_list=True.")
+        if neighbors.update_fn is not update and not _alike(getattr(neighbors.update_fn, "settings", None), settings):
+            return find_anew(jnp.asarray(position), neighbors, kwargs)
         position, kept, room, exact = jnp.asarray(position), neighbors.kept, neighbors.max_occupancy, neighbors.exact
         dim, present = position.shape[1], None
         if fractional_coordinates and kept is not None:
@@ -212,7 +235,34 @@ def neighbor_list(
         now = {"reference_position": reference, "error": error, "kept": new, "occupancy": held, "measured_in": measured_in}
         return dataclasses.replace(neighbors, idx=idx, **now)
 
+    functions = displacement_or_metric, custom_mask_function
+    settings = functions, box, cutoff, skin, form, disable_cell_list, mask_self, fractional_coordinates
+    update.settings = settings  # pyright: ignore[reportFunctionMemberAccess]
     return partition.NeighborListFns(allocate, update)
+
+
+def _alike(some: Any, others: tuple) -> bool:  # noqa: ANN401
+    """Say whether functions were made with the same arguments: displacements may be two of the same space of jax-md."""
+    if some is None:
+        return False
+    (move, mask), box, *rest = some
+    (other_move, other_mask), other_box, *others_rest = others
+    if rest != others_rest or mask is not other_mask or not _same_box(box, other_box):
+        return False
+    if move is other_move:
+        return True
+    both = [None if each is None else space_of(each, np.shape(box)[0] if np.ndim(box) else 3) for each in (move, other_move)]
+    known, other = both
+    return known is not None and other is not None and known.fractional == other.fractional and _same_box(known.box, other.box)
+
+
+def _same_box(box: Given, other: Given) -> bool:
+    """Say whether two boxes are known to be the same."""
+    if box is other:
+        return True
+    if box is None or other is None or isinstance(box, Tracer) or isinstance(other, Tracer):
+        return False
+    return bool(np.array_equal(np.asarray(box), np.asarray(other)))
 
 
 def _code_of(status: Array) -> Array:

@@ -11,6 +11,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array, lax
 from jax.custom_derivatives import SymbolicZero
 from jax.extend.core import Primitive
@@ -20,7 +21,7 @@ from jfrnn._geometry import Box, bring_near, translation
 from jfrnn._search.gathers import bind, collect, define, gather
 from jfrnn._search.geometry import kept_list, kept_shifts, norms, vectors_of
 from jfrnn._search.present import Present, Topology
-from jfrnn._tracing import call_apart, compile_program, on_platform
+from jfrnn._tracing import call_apart, compile_program, on_platform, ruled, still
 
 _Lines = tuple[KeptList, Topology, Array]  # a list at present positions, and its distances, 0 where there is no pair
 
@@ -28,40 +29,40 @@ _Lines = tuple[KeptList, Topology, Array]  # a list at present positions, and it
 @compile_program
 def lengths(present: Present) -> tuple[Array, Array]:
     """Return distances [n, capacity] and the mask, as `norms` of the vectors gives them."""
-    return _lengths(present.sources, present.box, lax.stop_gradient(present))
-
-
-@jax.custom_jvp
-def _lengths(sources: Array, box: Box | None, fixed: Present) -> tuple[Array, Array]:
-    return call_apart(kept_distances, kept_list(_at(sources, box, fixed)))
+    distances, mask = _lengths(present.sources, present.box, lax.stop_gradient(present))
+    return distances, mask
 
 
 def _at(sources: Array, box: Box | None, fixed: Present) -> Present:
     return dataclasses.replace(fixed, sources=sources, rows=sources, box=box)
 
 
-@functools.partial(_lengths.defjvp, symbolic_zeros=True)
-def _lengths_jvp(primals: tuple, tangents: tuple) -> tuple[Any, Any]:
-    sources, box, present = primals
-    moved, stretched, _ = tangents
-    if any(not isinstance(x, SymbolicZero) for x in jax.tree.leaves(stretched)):
+def _find(sources: Array, box: Box | None, fixed: Present) -> tuple[Array, Array]:
+    return call_apart(kept_distances, kept_list(_at(sources, box, fixed)))
+
+
+def _like(sources: Array, _: Box | None, fixed: Present) -> list[jax.ShapeDtypeStruct]:
+    return [jax.ShapeDtypeStruct(fixed.topology.idx.shape, dtype) for dtype in (sources.dtype, np.dtype(bool))]
+
+
+def _move(primals: tuple, tangents: tuple) -> tuple[list[Array], list[Any]]:
+    (sources, box, present), (moved, stretched, _) = primals, tangents
+    distances, mask = _lengths(*primals)
+    none = still(mask)
+    if not all(isinstance(x, SymbolicZero) for x in jax.tree.leaves(stretched)):
         both = (moved, stretched), (sources, box)
         moved, stretched = jax.tree.map(lambda x, at: jnp.zeros_like(at) if isinstance(x, SymbolicZero) else x, *both)
-
-        def by_vectors(sources: Array, box: Box | None) -> tuple[Array, Array]:
-            vectors, mask, _ = vectors_of(_at(sources, box, present))
-            return norms(vectors), mask
-
-        (_, mask), (slopes, none) = jax.jvp(by_vectors, (sources, box), (moved, stretched))
-        return (_lengths(*primals)[0], mask), (slopes, none)
-    distances, mask = _lengths(*primals)
-    none = SymbolicZero(jax.typeof(mask).to_tangent_aval())
+        by_vectors = lambda sources, box: norms(vectors_of(_at(sources, box, present))[0])  # noqa: E731
+        return [distances, mask], [jax.jvp(by_vectors, (sources, box), (moved, stretched))[1], none]
     if isinstance(moved, SymbolicZero):
-        return (distances, mask), (SymbolicZero(jax.typeof(distances)), none)
+        return [distances, mask], [still(distances), none]
     fixed = kept_list(_at(sources, box, present))
     near = sources if fixed.lattice is None else bring_near(sources, fixed.lattice).points
     lines = fixed._replace(sources=near, rows=near), present.topology, distances
-    return (distances, mask), (bind(_along_p, moved, lines), none)
+    return [distances, mask], [bind(_along_p, moved, lines), none]
+
+
+_lengths = ruled("jfrnn_lengths", _find, _like, _move)
 
 
 def _directions(lines: _Lines) -> Array:

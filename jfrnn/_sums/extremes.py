@@ -15,7 +15,7 @@ from jfrnn._sums.fused import extremes, extremes_of_list
 from jfrnn._sums.relations import Kept, Listed, Relation, evaluate, is_fused, summable
 from jfrnn._sums.summation import bind_sum
 from jfrnn._sums.terms import Derived, Groups, Term, choose, fresh_labels, join, make_term
-from jfrnn._tracing import call_apart, compile_program
+from jfrnn._tracing import call_apart, compile_program, ruled, still
 
 _Best = tuple[Array, Array, Array | None]  # per row and element [b, k]: largest value, its source (n: none), its shift [b, k, d]
 
@@ -28,23 +28,32 @@ def bind_extremes(relation: Relation, term: Term, operands: Groups, largest: boo
     relation = summable(relation, term)
     find = functools.partial(_find, term=term, largest=largest)
     found = call_apart(lambda *given: find(given[0], operands=given[1]), lax.stop_gradient(relation), lax.stop_gradient(operands))
-    return _values(found, operands, term, largest, relation.sizes[1])
+    return _extremes(found, operands, term=term, largest=largest, n=relation.sizes[1])
 
 
-@functools.partial(jax.custom_jvp, nondiff_argnums=(2, 3, 4))
-def _values(found: list[_Best], operands: Groups, term: Term, largest: bool, n: int) -> list[Array]:
+def _values(found: list[_Best], _: Groups, *, term: Term, largest: bool, n: int) -> list[Array]:
     """Return the extremes that were found, which are differentiable in the operands: only then are they evaluated once more."""
-    del operands, n
+    del n
     values = [value if largest else -value for value, *_ in found]
     return [value.reshape(-1, *like.shape) for value, like in zip(values, term.summands, strict=True)]
 
 
-@functools.partial(_values.defjvp, symbolic_zeros=True)
-def _move(term: Term, largest: bool, n: int, primals: tuple, tangents: tuple) -> tuple[list[Array], list[Array]]:
+def _like(found: list[_Best], _: Groups, *, term: Term, largest: bool, n: int) -> list[jax.ShapeDtypeStruct]:
+    del largest, n
+    each = zip(found, term.summands, strict=True)
+    return [jax.ShapeDtypeStruct((value.shape[0], *like.shape), value.dtype) for (value, *_), like in each]
+
+
+def _move(
+    primals: tuple, tangents: tuple, *, term: Term, largest: bool, n: int
+) -> tuple[list[Array], Sequence[Array | SymbolicZero]]:
     (found, operands), moves = primals, tangents[1]
     flat, structure = jax.tree.flatten(operands)
     moved = structure.flatten_up_to(moves)
     moving = [not isinstance(move, SymbolicZero) for move in moved]
+    results = _extremes(found, operands, term=term, largest=largest, n=n)
+    if not any(moving):
+        return results, [still(x) for x in results]
 
     def evaluate(some: list[Array]) -> list[Array]:
         left = iter(some)
@@ -52,7 +61,10 @@ def _move(term: Term, largest: bool, n: int, primals: tuple, tangents: tuple) ->
         return _evaluate(found, jax.tree.unflatten(structure, chosen), term, n)
 
     some, theirs = (list(itertools.compress(each, moving)) for each in (flat, moved))
-    return _values(found, operands, term, largest, n), jax.jvp(evaluate, (some,), (theirs,))[1]
+    return results, jax.jvp(evaluate, (some,), (theirs,))[1]
+
+
+_extremes = ruled("jfrnn_extremes", _values, _like, _move)
 
 
 def _evaluate(found: list[_Best], operands: Groups, term: Term, n: int) -> list[Array]:

@@ -337,8 +337,10 @@ def _summable(x: Given, dtype: np.dtype) -> Array:
             f"fn must return floats or integers, got {type(x).__name__}: return arrays, in a pytree if there are several."
         )
     array = jnp.asarray(x)
+    split = jnp.issubdtype(array.dtype, jnp.complexfloating)
+    how = "return its real and its imaginary part" if split else "convert it, e.g. with .astype(jnp.int32)"
     if not (jnp.issubdtype(array.dtype, jnp.floating) or jnp.issubdtype(array.dtype, jnp.integer)):
-        raise TypeError(f"fn must return floats or integers, got {array.dtype}: convert it, e.g. with .astype(jnp.int32).")
+        raise TypeError(f"fn must return floats or integers, got {array.dtype}: {how}.")
     is_loose = jnp.issubdtype(array.dtype, jnp.floating) and jax.typeof(array).weak_type
     return array.astype(dtype if is_loose else array.dtype)
 

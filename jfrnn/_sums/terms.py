@@ -131,13 +131,20 @@ _KNOWN: "weakref.WeakKeyDictionary[Any, dict[Any, Derived]]" = weakref.WeakKeyDi
 
 
 def _keep(owner: object, derived: "Derived") -> "Derived":
-    """Return an equal term that was made for the owner before; otherwise remember this one."""
+    """Return an equal term that was made for the owner before; otherwise remember this one.
+
+    Where functions have derivatives of their own (`jax.custom_jvp`), which a jaxpr names and does not show, terms are equal only if
+    their derivatives are, too.
+    """
     closed = derived.term.jaxpr
     if closed.consts:
         return derived
+    programs = [closed]
+    if any(equation.primitive.name.startswith("custom_") for inner in _jaxprs(closed) for equation in inner.jaxpr.eqns):
+        programs.append(_pull(derived.term))
     key = (
-        str(closed.jaxpr),
-        tuple(_literals(closed.jaxpr)),
+        tuple(str(each.jaxpr) for each in programs),
+        tuple(_constants(programs)),
         jax.tree.structure(derived.needed),
         tuple(jax.tree.leaves(derived.needed)),
         derived.term.labels,
@@ -149,14 +156,42 @@ def _keep(owner: object, derived: "Derived") -> "Derived":
         return derived
 
 
-def _literals(jaxpr: Jaxpr) -> Iterator[bytes]:
-    """Yield the constants in a jaxpr, whose printed form may show only a few digits of them."""
-    for equation in jaxpr.eqns:
-        yield from (np.asarray(v.val).tobytes() for v in equation.invars if isinstance(v, Literal))
+def _jaxprs(closed: ClosedJaxpr) -> Iterator[ClosedJaxpr]:
+    """Yield a jaxpr and all that stand in it."""
+    yield closed
+    for equation in closed.jaxpr.eqns:
         for inner in (x for value in equation.params.values() for x in (value if isinstance(value, tuple) else (value,))):
             if isinstance(inner, Jaxpr | ClosedJaxpr):
-                yield from _literals(inner.jaxpr if isinstance(inner, ClosedJaxpr) else inner)
-    yield from (np.asarray(v.val).tobytes() for v in jaxpr.outvars if isinstance(v, Literal))
+                yield from _jaxprs(inner if isinstance(inner, ClosedJaxpr) else ClosedJaxpr(inner, ()))
+
+
+def _constants(programs: Sequence[ClosedJaxpr]) -> Iterator[bytes]:
+    """Yield what jaxprs know of numbers: of literals their printed form may show a few digits only, of closed-over arrays none."""
+    for closed in (inner for each in programs for inner in _jaxprs(each)):
+        read = [v for equation in closed.jaxpr.eqns for v in equation.invars] + closed.jaxpr.outvars
+        yield from (np.asarray(v.val).tobytes() for v in read if isinstance(v, Literal))
+        yield from (np.asarray(x).tobytes() for x in closed.consts)
+
+
+def _pull(term: Term) -> ClosedJaxpr:
+    """Trace how cotangents of the summands become those of the operands."""
+    summands = [k for k, x in enumerate(term.summands) if is_moving(x)]
+    flat = sum(term.operands, ())
+    moving = [k for k, x in enumerate(flat) if is_moving(x)]
+
+    def pull(real: Array, shift: Array, given: list[Array], cotangents: list[Array]) -> Sequence[Array]:
+        def of_moving(*moved: Array) -> list[Array]:
+            now = list(given)
+            for k, x in zip(moving, moved, strict=True):
+                now[k] = x
+            results = term(real, shift, split_operands(now, term.operands))
+            return [results[k] for k in summands]
+
+        return jax.vjp(of_moving, *(given[k] for k in moving))[1](cotangents)
+
+    with without_mesh():
+        like = [term.summands[k] for k in summands]
+        return jax.make_jaxpr(pull)(jax.ShapeDtypeStruct((), np.bool_), term.shift, list(flat), like)
 
 
 class Derived(NamedTuple):

@@ -153,8 +153,9 @@ def _run(scalars: Scalars, nested: Internal, inputs: Sequence[Values]) -> list[V
     for eqn in jaxpr.eqns:
         name = eqn.primitive.name
         if name not in TABLE:
+            what = "a derivative of jax.custom_vjp" if name == "custom_lin" else f"the primitive {name!r}"
             raise NoTranslationError(
-                f'the primitive {name!r} has no translation into a kernel: write the function without it, or pass backend="jax".'
+                f'{what} has no translation into a kernel: write the function without it, or pass backend="jax".'
             )
         specs = [_spec(v.aval, f"a result of {name!r}") for v in eqn.outvars]
         equation = Equation(scalars, eqn.primitive, eqn.params, specs, functools.partial(_run, scalars))

@@ -39,3 +39,4 @@ from jfrnn._tracing.late import (
     without_mesh,
 )
 from jfrnn._tracing.programs import compile_program
+from jfrnn._tracing.ruled import ruled, still

@@ -309,6 +309,10 @@ def test_forms_of_matscipy_and_vesin():
     assert len(both) * 2 == len(i)
     whole = {(*pair, *shift) for pair, shift in zip(full[0].tolist(), s.tolist())}
     assert both | {(b, a, -x, -y, -z) for a, b, x, y, z in both} == whole
+    single = jfrnn.vesin.NeighborList(cutoff=2.0, full_list=True).compute(x.astype(np.float32), cell, True, "D")
+    assert [part.dtype.name for part in single] == ["float32"]
+    (alone,) = jfrnn.vesin.ase_neighbor_list("i", atoms, 2.0)
+    np.testing.assert_array_equal(alone, i)
     with pytest.raises(ValueError, match="quantities must be letters of 'ijPSDd'"):
         jfrnn.vesin.NeighborList(cutoff=2.0, full_list=True).compute(x, cell, True, "x")
     refuses(TypeError, r"cutoff must be a number \[length\], got list", jfrnn.vesin.NeighborList, cutoff=["a"], full_list=True)

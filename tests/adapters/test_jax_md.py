@@ -171,8 +171,8 @@ def test_boxes_that_change():
     refuses(ValueError, "displacement_or_metric given", jax_md.neighbor_list(None, 1.0, CUTOFF).allocate, x)
     refuses(ValueError, "format must be a member of NeighborListFormat", jax_md.neighbor_list, None, 1.0, CUTOFF, format="Dense")
     refuses(TypeError, r"cannot run inside jax.jit", jax.jit(lambda x: jax_md.neighbor_list(free, 1.0, CUTOFF).allocate(x).idx), x)
-    for cutoff, skin in ((np.nan, 0.0), (-1.0, 0.0), (CUTOFF, -0.1), (np.inf, 0.0)):
-        refuses(ValueError, "r_cutoff must be finite and above 0", jax_md.neighbor_list, free, 3.0, cutoff, skin)
+    for cutoff, skin in ((np.nan, 0.0), (-1.0, 0.0), (CUTOFF, -0.1), (CUTOFF, np.inf)):
+        refuses(ValueError, "r_cutoff must be above 0, and dr_threshold finite", jax_md.neighbor_list, free, 3.0, cutoff, skin)
     refuses(
         TypeError, "position must hold floats, got int", jax_md.neighbor_list(free, 3.0, CUTOFF).allocate, np.zeros((4, 3), int)
     )
@@ -191,6 +191,38 @@ def test_positions_that_are_not_finite_are_told(measured):
     assert (every.idx < 20).sum() == 20 * 19
     assert not fns.update(x, nbrs).did_buffer_overflow
     assert fns.update(lost, nbrs).did_buffer_overflow
+
+
+@pytest.mark.parametrize("form", FORMATS)
+def test_lists_of_other_functions(form):
+    """A list that was made for another box, cutoff or displacement has the pairs of the functions that update it."""
+    x = points(False)
+
+    def made(move=None, lengths=LENGTHS, cutoff=CUTOFF, **options):
+        return jax_md.neighbor_list(move, lengths, cutoff, SKIN, capacity_multiplier=4.0, format=form, **options)
+
+    old = made().allocate(x)
+    others = [
+        made(),
+        made(lengths=1.1 * LENGTHS),
+        made(cutoff=0.5),
+        made(cutoff=0.8),
+        made(mask_self=False),
+        made(free),
+        made(free, disable_cell_list=True),
+    ]
+    for each in others:
+        updated, own = jax.jit(each.update)(x, old), each.allocate(x)
+        assert int(updated.error.code) == 0
+        assert pairs_of(updated.idx, N, form) == pairs_of(own.idx, N, form)
+    for other in set(FORMATS) - {form}:
+        refuses(ValueError, "allocate anew", jax_md.neighbor_list(None, LENGTHS, CUTOFF, SKIN, format=other).update, x, old)
+
+
+def test_boxes_too_small_for_their_cutoff_are_measured():
+    x = points(False, 20)
+    for cutoff in (40.0, 4000.0, 1e30, np.inf):
+        assert int((jax_md.neighbor_list(nearest, LENGTHS, cutoff).allocate(x, box=LENGTHS).idx < 20).sum()) == 20 * 19
 
 
 def test_boxes_of_lists_that_are_measured():

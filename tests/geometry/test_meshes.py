@@ -155,6 +155,17 @@ def test_what_is_no_mesh_is_refused(vertices, faces, error, match):
     refuses(error, match, jfrnn.merge_vertices, vertices, faces)
 
 
+def test_vertices_that_would_be_rounded_are_refused():
+    with jax.enable_x64(False):
+        refuses(
+            TypeError,
+            "vertices are float64, but JAX's 64-bit mode is off",
+            jfrnn.merge_vertices,
+            np.zeros((1, 3)),
+            np.zeros((1, 3), int),
+        )
+
+
 def test_it_does_not_run_while_tracing():
     with pytest.raises(TypeError, match=r"cannot run inside jax\.jit: call it before"):
         jax.jit(jfrnn.merge_vertices)(np.zeros((2, 3)), np.zeros((1, 3), int))

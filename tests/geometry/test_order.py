@@ -206,6 +206,13 @@ def test_bad_coordinates_keys_and_bits_are_refused(call, error, message):
     refuses(error, message, call)
 
 
+def test_wide_coordinates_are_refused_in_either_mode():
+    with jax.enable_x64(False):
+        for far in (2**40, 2**32 + 5):
+            refuses(ValueError, r"coords must be in \[0, 2147483648\)", morton_encode, np.array([[far, 0]]))
+            refuses(ValueError, "got values from 0 to", hilbert_encode, np.array([[far, 0]], np.uint64), 10)
+
+
 def test_keys_of_the_other_mode_are_refused():
     wide = np.asarray(morton_encode(np.array([1, 2, 3])))
     with jax.enable_x64(False):

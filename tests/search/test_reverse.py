@@ -265,6 +265,30 @@ MEASURED = [(box, dim, 1.0) for box in BOXES for dim in (2, 3)] + [("open", 3, 1
 PAIRWISE = [("open", 2, 1.0, True, np.float64), ("images", 3, 1.0, False, np.float32), ("open", 3, 1e-24, False, np.float32)]
 
 
+@pytest.mark.parametrize("what", ["distances", "largest"])
+def test_second_derivatives_through_a_loop(what):
+    """Of the body of a loop JAX drops rules of `jax.custom_jvp` once it has applied them."""
+    x = jnp.asarray(np.random.default_rng(0).random((8, 3)), jnp.float32)
+    nbrs = jfrnn.search(x, 0.6, skin=0.3, capacity=8, backend="warp")
+
+    def energy(x):
+        if what == "distances":
+            distances, mask = nbrs.distances(x)
+            return jnp.where(mask, (0.6 - distances) ** 2, 0).sum()
+        return (jfrnn.pair_sum(lambda r, i, j: (r @ r) ** 2, x, 0.6, reduce="max", backend="warp") ** 2).sum()
+
+    def step(x, _=None):
+        return x - 0.03 * jax.grad(energy)(x), None
+
+    def by_jvp(moved):
+        return jax.jvp(jax.grad(lambda x: (moved(x) ** 2).sum()), (x,), (jnp.sin(9 * x),))[1]
+
+    straight = by_jvp(lambda x: step(x)[0])
+    assert float(jnp.abs(straight).max()) > 0.1
+    np.testing.assert_allclose(by_jvp(lambda x: jax.lax.scan(step, x, None, length=1)[0]), straight, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(by_jvp(lambda x: jax.vmap(lambda x: step(x)[0])(x[None])[0]), straight, rtol=1e-4, atol=1e-5)
+
+
 def test_derivatives_of_distances_have_the_same_bits_in_each_call():
     """Threads share the rows, and none knows which of them it gets."""
     x = jnp.asarray(np.random.default_rng(3).random((20_000, 3)), jnp.float32)

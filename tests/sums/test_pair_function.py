@@ -3,6 +3,8 @@
 import functools
 import re
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -67,3 +69,34 @@ def test_errors_of_a_function_say_what_it_is_given(error, fn, values, matches, s
 @pytest.mark.parametrize("fn", [lambda r, *values: r, lambda r, i, j, k=2.0: k * r, lambda *pair: pair[0]])
 def test_functions_that_can_take_three_arguments_do(fn):
     assert jfrnn.pair_sum(fn, X, 1.0, backend="brute").shape == X.shape
+
+
+TABLE, SCALE = jnp.array([1.0, 2.0], jnp.float32), 1.0
+
+
+def in_a_program(r, i, j):
+    return jax.jit(lambda square: square * TABLE[0])(r @ r)
+
+
+def with_a_rule(r, i, j):
+    function = jax.custom_jvp(lambda square: square * 1.0)
+    function.defjvp(lambda primals, tangents: (function(*primals), SCALE * tangents[0]))
+    return function(r @ r)
+
+
+@pytest.mark.parametrize("backend", ["warp", "brute"])
+def test_what_a_function_knows_may_change(monkeypatch, backend):
+    """Numbers in programs and in rules for derivatives, too, which a printed jaxpr does not show."""
+    x = jnp.asarray(np.random.default_rng(0).random((20, 3)), jnp.float32)
+
+    def both():
+        sums = jfrnn.pair_sum(in_a_program, x, 0.5, backend=backend)
+        slopes = jax.grad(lambda x: jfrnn.pair_sum(with_a_rule, x, 0.5, backend=backend).sum())(x)
+        return sums, slopes
+
+    before = both()
+    monkeypatch.setitem(globals(), "TABLE", jnp.array([7.0, 2.0], jnp.float32))
+    monkeypatch.setitem(globals(), "SCALE", 5.0)
+    after = both()
+    np.testing.assert_allclose(after[0], 7 * before[0], rtol=1e-5)
+    np.testing.assert_allclose(after[1], 5 * before[1], rtol=1e-5)

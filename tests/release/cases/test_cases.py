@@ -198,6 +198,12 @@ def test_jitter_stays_in_the_cell_of_its_site(amplitude):
     assert np.abs(moved.mean(axis=0) - amplitude / 2).max() < 0.02 * amplitude
 
 
+@pytest.mark.parametrize("spacing", [3e-4, 3.1e-3, 1.37e-4])
+def test_jitter_keeps_to_a_domain_that_is_no_multiple_of_the_spacing(spacing):
+    scene = cases.scene("jitter", spacing=spacing, fill=0.9, amplitude=1.0, dtype="float64", dim=2)
+    assert (scene.positions >= 0).all() and (scene.positions <= scene.lengths).all()
+
+
 @pytest.mark.parametrize("dim", [2, 3])
 @pytest.mark.parametrize("name", SIZED)
 def test_more_fill_is_more_points_and_close_to_it(name, dim):
