@@ -137,6 +137,11 @@ def share_bits(m: int) -> int:
     return next((bits for bits in range(5) if _shares(m, bits) <= GRID["WARPS"]), 5)
 
 
+def lanes_of_query(m: int) -> int:
+    """Return how many lanes of a warp a query has once its pairs are known: several where a warp serves few."""
+    return min(QUERY_BLOCK >> share_bits(m), 4)
+
+
 def query_blocks(m: int) -> int:
     """Return how many warps m queries are shared among."""
     return _shares(m, share_bits(m))
@@ -165,13 +170,15 @@ def walking_blocks(kind: Kind) -> int:
 
 
 @functools.lru_cache(512)
-def cell_kernels(kind: Kind) -> Kernels:
-    """Return the kernels that sort by cell, and that list or count."""
-    compiled, constants = kind.compiled(), {"LIST": kind.lists, "SUMS": 0, **GRID}
+def cell_kernels(kind: Kind, lanes: int = 1) -> Kernels:
+    """Return the kernels that sort by cell, and that list or count, with so many `lanes_of_query`."""
+    compiled, lanes = kind.compiled(), lanes if kind.lists else 1
+    constants = {"LIST": kind.lists, "SUMS": 0, "QUERY_LANES": lanes, **GRID}
 
     def query_kernel(name: str, crossing: bool = False) -> Kernel:
         entry = Entry("Rows.run", QUERY_BLOCK, walking_blocks(kind), "Rows_cross" * crossing)
-        return declare_kind(compiled, f"{name}_cuda", "rows.cuh", entry, cuda=True, constants=constants | {"CROSSING": crossing})[0]
+        own = constants | {"CROSSING": crossing}
+        return declare_kind(compiled, f"{name}_cuda_{lanes}l", "rows.cuh", entry, cuda=True, constants=own)[0]
 
     methods = ("find_bounds", "lay_out_grid", "count_cells", "scan_counts", "scatter_ids", "gather_places")
     stages = [Entry(f"Search.{method}", BLOCK) for method in methods]

@@ -292,13 +292,15 @@ def _few_callable(kind: Kind) -> Call:
 def plan_on_cuda(kind: Kind, shapes: Shapes, multiprocessors: int) -> Plan:
     """Return what is launched for a search among cells."""
     numbers = plan_numbers(kind, shapes)
-    launches = cells_cuda.cell_kernels(kind).launches(numbers["n"], numbers["m"], kind.own, multiprocessors)
+    kernels = cells_cuda.cell_kernels(kind, cells_cuda.lanes_of_query(numbers["m"]))
+    launches = kernels.launches(numbers["n"], numbers["m"], kind.own, multiprocessors)
     return Plan(place_launches(launches), numbers, absent(kind))
 
 
 def _plan_tree_on_cuda(kind: Kind, shapes: Shapes, _: int) -> Plan:
     numbers = plan_numbers(kind, shapes)
-    walk = Launch(tree_cuda.query_kernel(kind), tree_cuda.walk_threads(numbers["m"]), {"of_queries": 0})
+    query = tree_cuda.query_kernel(kind, cells_cuda.lanes_of_query(numbers["m"]))
+    walk = Launch(query, tree_cuda.walk_threads(numbers["m"]), {"of_queries": 0})
     return Plan([*fit_tree(tree_cuda.fit_kernel(kind), numbers), walk], numbers, absent(kind))
 
 

@@ -101,7 +101,8 @@ def _cpu_callable(kind: Kind, term: TermText, key: str) -> Call:
 def _cuda_callable(kind: Kind, term: TermText, key: str) -> Call:
     def plan(shapes: Shapes, multiprocessors: int) -> Plan:
         numbers = _numbers(kind, term, shapes)
-        launches = pair_sum_cuda.sum_kernels(kind, term, key).launches(numbers["n"], numbers["m"], kind.own, multiprocessors)
+        kernels = pair_sum_cuda.sum_kernels(kind, term, key, cells_cuda.lanes_of_query(numbers["m"]))
+        launches = kernels.launches(numbers["n"], numbers["m"], kind.own, multiprocessors)
         return Plan([Launch(x.kernel, x.threads, beside=x.beside) for x in launches], numbers)
 
     return describe_sums("pair_sum_cuda", kind, key, plan, (*_GIVEN, *_WORDS), more={"values": scalar_of(kind)})

@@ -86,6 +86,10 @@ struct Rows : Walk<Rows> {
     }
     // Writes the pairs that are held into the rows.
     JFRNN_MEMBER void settle(const Group& group, const Pairs& pairs, bool finished) {
+        if constexpr (QUERY_LANES >= 4) {
+            settle_few(group, pairs, finished);
+            return;
+        }
         Warp& warp = shared_warp();
         // Behind the last block stands one of fill values, with which all rows are filled up, or one that no query has met.
         warp.hits[pairs.tested / 32][lane] = finished ? ALL : 0;
@@ -111,6 +115,30 @@ struct Rows : Walk<Rows> {
         }
         if (!finished)
             row.leave(lane);
+    }
+    // The same of few queries, one after the other: a lane has one candidate of each block, where it would else have a query, or none.
+    JFRNN_MEMBER void settle_few(const Group& group, const Pairs& pairs, bool finished) {
+        Warp& warp = shared_warp();
+        __syncwarp();
+#pragma unroll 1
+        for (int query = 0; query < group.size; ++query) {
+            const int row = __shfl_sync(ALL, group.my_id, query), room = row_room(starts, row, capacity);
+            const long long begin = row_begin(starts, row, capacity);
+            int written = (int)warp.written[query];
+#pragma unroll 4
+            for (unsigned int block = 0; block < pairs.tested / 32; ++block) {
+                const unsigned int hits = warp.hits[block][query];
+                const int slot = written + __popc(hits & ((1u << lane) - 1)), id = warp.ids[32 * block + lane];
+                if ((hits >> lane & 1) && slot < room)
+                    write_slot(idx, receivers, begin + slot, IDS == 1 ? source_of(id) : id, row);
+                written += __popc(hits);
+            }
+            for (int slot = written + lane; finished && slot < room; slot += 32)
+                write_slot(idx, receivers, begin + slot, fill_value(), row);
+            if (lane == 0)
+                warp.written[query] = written;
+        }
+        __syncwarp();
     }
     // Writes what waits for the rows behind the first `before` slots of each: eight lanes write one row, and maybe more than waits,
     // that will be written again.

@@ -28,6 +28,12 @@ struct Taken {
     } numbers[MOST];
 };
 
+// The query that a lane serves, if there is one: its number in the group, and its id.
+struct LaneQuery {
+    int query, id;
+    bool is_query;
+};
+
 struct Sums : Walk<Sums> {
     static constexpr bool BY_BLOCK = TOTALS > 0;
     static constexpr bool NAMED = SUMS == 2;  // the sources of summands are asked for
@@ -61,20 +67,29 @@ struct Sums : Walk<Sums> {
             warp.ids[pairs.tested + 32 * lane] = 0;
         __syncwarp();
         Reduction reduction(n);
+        // A lane of several takes every so many-th block of candidates.
+        constexpr unsigned int EVERY = QUERY_LANES == 4 ? 0x11111111 : QUERY_LANES == 2 ? 0x55555555 : ALL;
+        const int query = lane / QUERY_LANES;
+        auto of_query = [&](auto x) { return QUERY_LANES > 1 ? __shfl_sync(ALL, x, query) : x; };
+        const LaneQuery mine{query, of_query(group.my_id), query < group.size};
+        Pairs of_lane = pairs;
+        of_lane.met_in = of_query(pairs.met_in) & EVERY << lane % QUERY_LANES;
         if (READS_ROWS > 0 && turned)
-            reduce_held<false, READS_ROWS != 0>(group, pairs, reduction);
+            reduce_held<false, READS_ROWS != 0>(group, mine, of_lane, reduction);
         else
-            reduce_held<PERIODIC != 0 && INSIDE, false>(group, pairs, reduction);
-        reduction.store(results, {lane, group.my_id, served, lane < group.size, pairs.fresh, finished});
+            reduce_held<PERIODIC != 0 && INSIDE, false>(group, mine, of_lane, reduction);
+        if constexpr (QUERY_LANES > 1)
+            reduction.reduce_over_warp<QUERY_LANES>();
+        reduction.store(results, {lane, mine.id, served, mine.is_query && lane % QUERY_LANES == 0, pairs.fresh, finished});
     }
     // AT_HOME: no pair has a shift. TURNED: coordinates are those that were given, and shifts are counted between these.
     template <bool AT_HOME, bool TURNED>
-    JFRNN_MEMBER void reduce_held(const Group& group, const Pairs& pairs, Reduction& reduction) {
+    JFRNN_MEMBER void reduce_held(const Group& group, const LaneQuery& mine, const Pairs& pairs, Reduction& reduction) {
         const Term term(shared_values);
-        const Place here = lane < group.size ? load_query(group.place + lane) : Place{{0, 0, 0}, 0};
-        const Term::Own own_part = term.own<AT_HOME>(
-            own_values + (long long)group.my_id * OWN, here.p, TURNED ? queries + (long long)group.my_id * ROW : nullptr);
-        HeldPairs held(pairs, lane);
+        const Place here = mine.is_query ? load_query(group.place + mine.query) : Place{{0, 0, 0}, 0};
+        const Term::Own own_part =
+            term.own<AT_HOME>(own_values + (long long)mine.id * OWN, here.p, TURNED ? queries + (long long)mine.id * ROW : nullptr);
+        HeldPairs held(pairs, mine.query);
         held.advance();
         held.advance();
         Taken<TURNED> some, others;

@@ -14,9 +14,24 @@
 
 template <class Query>
 struct Walk : PairSearch {
-    JFRNN_MEMBER explicit Walk(const SearchArguments& given) : PairSearch(given) {}
+    JFRNN_MEMBER explicit Walk(const SearchArguments& given) : PairSearch(leave_if_idle(given)) {}
     JFRNN_MEMBER Query& query() { return *static_cast<Query*>(this); }
 
+    // Ends a warp for which `run` has no queries, before it finds out what others have to know.
+    JFRNN_FUNCTION const SearchArguments& leave_if_idle(const SearchArguments& given) {
+        const Scratch scratch(given.scratch, given.n, given.m, given.own, given.table);
+        const int block = blockIdx.x, of = block - ((int)gridDim.x - Shares(given.m).query_blocks);
+        bool idle = false;
+        if constexpr (CROSSING && !TREE)
+            idle = block >= scratch.shared.crossing + (scratch.shared.scattered << (5 - PART_BITS));  // parts, at most
+        else if (!TREE && of < 0)
+            idle = scratch.shared.scattered == 0;
+        else if (PERIODIC && !TREE)
+            idle = scratch.crosses[of];
+        if (idle)
+            asm volatile("exit;");
+        return given;
+    }
     JFRNN_MEMBER void run() {
         if constexpr (TREE) {
             serve(block, 0, 32);
