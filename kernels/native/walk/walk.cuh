@@ -17,16 +17,19 @@ struct Walk : PairSearch {
     JFRNN_MEMBER explicit Walk(const SearchArguments& given) : PairSearch(leave_if_idle(given)) {}
     JFRNN_MEMBER Query& query() { return *static_cast<Query*>(this); }
 
-    // Ends a warp for which `run` has no queries, before it finds out what others have to know.
+    // Ends a warp for which `run` has no queries, before it finds out what others have to know. Where queries are many, to ask takes
+    // longer than it saves.
     JFRNN_FUNCTION const SearchArguments& leave_if_idle(const SearchArguments& given) {
+        if constexpr (TREE || QUERY_LANES == 1)
+            return given;
         const Scratch scratch(given.scratch, given.n, given.m, given.own, given.table);
         const int block = blockIdx.x, of = block - ((int)gridDim.x - Shares(given.m).query_blocks);
         bool idle = false;
-        if constexpr (CROSSING && !TREE)
+        if constexpr (CROSSING)
             idle = block >= scratch.shared.crossing + (scratch.shared.scattered << (5 - PART_BITS));  // parts, at most
-        else if (!TREE && of < 0)
+        else if (of < 0)
             idle = scratch.shared.scattered == 0;
-        else if (PERIODIC && !TREE)
+        else if (PERIODIC)
             idle = scratch.crosses[of];
         if (idle)
             asm volatile("exit;");
