@@ -20,9 +20,9 @@ _MOST_POINTS = 2**31 - 32
 _MOST_KINDS = 2**12  # places in a table of their cutoffs are whole floats, too
 
 
-def refuse_rounding(name: str, dtype: np.dtype) -> None:
-    """Raise for float64 where JAX has no such arrays."""
-    if dtype == np.float64 and not jax.config.read("jax_enable_x64"):
+def refuse_rounding(name: str) -> None:
+    """Raise for arrays of float64 where JAX has none."""
+    if not jax.config.read("jax_enable_x64"):
         raise TypeError(
             f"{name} are float64, but JAX's 64-bit mode is off and would round them to float32 in silence: call "
             f'jax.config.update("jax_enable_x64", True) at start-up, or pass {name}.astype(np.float32).'
@@ -49,7 +49,8 @@ def check_positions(name: str, positions: Given, like: Array | None = None, numb
     dtype, shape = np.dtype(positions.dtype), tuple(positions.shape)
     if dtype not in (np.float32, np.float64):
         raise TypeError(f"{name} must be float32 or float64, got {dtype}: convert them first, e.g. with .astype(jnp.float32).")
-    refuse_rounding(name, dtype)
+    if dtype == np.float64:
+        refuse_rounding(name)
     if len(shape) != 2 or shape[1] not in (2, 3):
         turned = f": pass {name}.T" if len(shape) == 2 and shape[0] in (2, 3) else ""
         raise ValueError(f"{name} must have shape [n, 2] or [n, 3], one row per particle, got shape {list(shape)}{turned}.")
