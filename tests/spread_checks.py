@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import soon
+from checked import refuses
 from children import check, main
 from jax.sharding import AxisType, NamedSharding, PartitionSpec
 
@@ -126,6 +127,20 @@ def explicit_axes_without_a_context():
     nbrs = jfrnn.search(X, 0.5, skin=0.1)
     np.testing.assert_array_equal(jfrnn.search(x, 0.5).count, jfrnn.count(X, 0.5))
     np.testing.assert_array_equal(nbrs.update(x).idx, nbrs.idx)
+
+
+@check
+def batches_on_explicit_axes():
+    """They are refused, with advice that helps."""
+    mesh = jax.make_mesh((4,), ("p",), axis_types=(AxisType.Explicit,))
+    batch = jnp.stack([X, 0.9 * X, 0.8 * X, 0.7 * X])
+    spread = jax.device_put(batch, NamedSharding(mesh, PartitionSpec("p")))
+    count = jax.vmap(lambda x: jfrnn.count(x, 0.5))
+    with jax.set_mesh(mesh):
+        for each in (count, jax.jit(count), jax.vmap(lambda x: jfrnn.pair_sum(lambda r, i, j: r @ r, x, 0.5))):
+            refuses(ValueError, "jax.vmap cannot go over an axis that is sharded", each, spread)
+        gathered = jax.jit(lambda x: count(jax.sharding.reshard(x, PartitionSpec())))(spread)
+    np.testing.assert_array_equal(gathered, count(batch))
 
 
 MESH = jax.make_mesh((4,), ("p",), axis_types=(AxisType.Auto,))

@@ -7,6 +7,7 @@ forbidden. In a process that was forked after JAX had started, its threads are m
 """
 
 import contextlib
+import functools
 import os
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
@@ -19,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jax.core import Tracer
-from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
 Tree = Any  # a pytree of arrays, of any structure
 Given = Any  # an argument as the user passed it, before it is checked
@@ -123,14 +124,39 @@ def gather(x: Array) -> Array:
     Along automatic axes the compiler does this where needed. `jfrnn.distributed` divides the work instead.
     """
     spread = jax.typeof(x).sharding
-    if not any(spread.spec):
-        return x
+    if not any(spread.spec):  # one of a batch does not know over what that is sharded
+        is_one = isinstance(x, Tracer) and AxisType.Explicit in (spread.mesh.axis_types or ())
+        return _one_of_batch().bind(x) if is_one else x
     if isinstance(x, Tracer) or not isinstance(x.sharding, NamedSharding):
         return jax.sharding.reshard(x, NamedSharding(spread.mesh, PartitionSpec()))
     mesh = x.sharding.mesh
     if jax.sharding.get_abstract_mesh().empty:  # outside a mesh, its type must not name one
         mesh = Mesh(np.asarray(mesh.devices), mesh.axis_names)
     return jax.device_put(x, NamedSharding(mesh, PartitionSpec()))
+
+
+@functools.cache
+def _one_of_batch() -> Internal:
+    """Return a primitive that does nothing, but that `jax.vmap` refuses a batch that is sharded, whose parts JAX keeps apart."""
+    from jax.extend.core import Primitive
+    from jax.interpreters import ad, batching, mlir
+
+    def batch(args: Sequence[Array], dims: Sequence[int]) -> tuple[Array, int]:
+        spec = jax.typeof(args[0]).sharding.spec
+        if any(spec):
+            raise ValueError(
+                f"jax.vmap cannot go over an axis that is sharded over explicit axes of a mesh, got {spec}: gather the batch "
+                "before, x = jax.sharding.reshard(x, jax.sharding.PartitionSpec()), or make the axes of the mesh AxisType.Auto."
+            )
+        return one.bind(args[0]), dims[0]
+
+    one = Primitive("jfrnn_one_of_batch")
+    one.def_impl(lambda x: x)
+    one.def_abstract_eval(lambda x: x)
+    ad.deflinear2(one, lambda cotangent, _: [cotangent])
+    batching.primitive_batchers[one] = batch
+    mlir.register_lowering(one, lambda _, x: [x])
+    return one
 
 
 def own_transfers() -> AbstractContextManager[object]:
