@@ -211,10 +211,7 @@ class NeighborList(KeptSearch):
         Differentiable: displacements and distances, to any order in positions, queries and box; derivatives gather, as those of
         `vectors`. Jit: yes. vmap: yes.
         """
-        if self.idx.size > MOST_SLOTS:
-            raise ValueError(
-                f"edges() numbers slots by int32, and this list has {self.idx.size}: take `vectors`, or fewer queries."
-            )
+        self._check_slots("edges")
         if total is None:
             if isinstance(self.count, Tracer):
                 raise TypeError(
@@ -391,10 +388,17 @@ class NeighborList(KeptSearch):
                 with at_once():
                     check_held(pair_total(self.count, self.capacity), total)
             return flat_pairs(self.idx, self.count, self.source_count, total)
+        self._check_slots(name)
         with own_transfers():
             *made, held = flat_pairs_of(self.idx, near, self.source_count, total, self.problem.options.engine.native)
         check_held(held, total)
         return made[0], made[1], made[2]
+
+    def _check_slots(self, name: str) -> None:
+        if self.idx.size > MOST_SLOTS:
+            raise ValueError(
+                f"{name}() numbers slots by int32, and this list has {self.idx.size}: take `vectors`, or fewer queries."
+            )
 
     def _near_now(self, name: str, at: Now) -> Array | None:
         """Return which slots hold a pair now; without positions None, of a list that lacks no pairs as far as is known."""

@@ -259,6 +259,9 @@ def test_too_many_slots_are_refused():
     x = jax.ShapeDtypeStruct((2**25, 3), np.float32)
     refuses(ValueError, "numbers slots by int32", jax.eval_shape, lambda x: jfrnn.search(x, 0.1, capacity=64, reverse=True), x)
     refuses(TypeError, "reverse", jfrnn.search, np.zeros((2, 3)), 1.0, reverse=1)
+    for name, of in (("pairs", lambda nbrs, x: nbrs.pairs(10, positions=x)), ("edges", lambda nbrs, x: nbrs.edges(x, 10).mask)):
+        message = rf"{name}\(\) numbers slots by int32, and this list has 2147483648"
+        refuses(ValueError, message, jax.eval_shape, lambda x, of=of: of(jfrnn.search(x, 0.1, capacity=64), x), x)
 
 
 MEASURED = [(box, dim, 1.0) for box in BOXES for dim in (2, 3)] + [("open", 3, 1e-24), ("nearest", 3, 1e15)]
