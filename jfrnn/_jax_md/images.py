@@ -146,7 +146,8 @@ def neighbor_list_multi_image(  # noqa: D417 (four arguments share a line)
         reference = jnp.where(moved, position, neighbors.reference_position)
         reference_box = jnp.where(moved, matrix, neighbors.reference_box)
         overflow = neighbors.did_buffer_overflow | (held > room) | (kept.status != 0)
-        return made_of((idx, shifts, reference, reference_box, matrix), overflow, kept, room)
+        made = made_of((idx, shifts, reference, reference_box, matrix), overflow, old if others else kept, room)
+        return dataclasses.replace(made, update_fn=neighbors.update_fn)  # so that loops can carry it, whoever updates it
 
     settings = cutoff, skin, form, fractional_coordinates, None if pbc is None else np.asarray(pbc).tolist()
     update.settings = settings  # pyright: ignore[reportFunctionMemberAccess]

@@ -158,18 +158,26 @@ def neighbor_list(
         return kept, exact
 
     def find_anew(position: Array, neighbors: NeighborList, kwargs: dict[str, Given]) -> NeighborList:
-        """Find the neighbors of a list that other functions made, which know other cutoffs, boxes or displacements."""
+        """Find the neighbors of a list that other functions made, which know other cutoffs, boxes or displacements.
+
+        All but pairs and positions stays as it was, so that loops can carry the list; who made it finds its own pairs anew.
+        """
+        if not isinstance(neighbors, NeighborList):
+            raise TypeError(f"update() was given a list of {type(neighbors).__module__}: allocate one with these functions.")
         if neighbors.format != form:
             raise ValueError(f"update() of format {form.name} was given a list of format {neighbors.format.name}: allocate anew.")
-        room, n = neighbors.max_occupancy, len(position)
-        most = neighbors.kept.capacity if neighbors.kept is not None else room if form is Dense else max(n - mask_self, 1)
-        kept, exact = find(position, kwargs, capacity=max(most, 1))
+        (n, dim), room, theirs = position.shape, neighbors.max_occupancy, getattr(neighbors.update_fn, "settings", None)
+        most = n
+        if neighbors.kept is not None and theirs is not None:  # as many as at the density of that list, and half more
+            wider = reach * dim**0.5 / (theirs[2] + theirs[3])
+            most = min(n, int(1.5 * neighbors.kept.capacity * max(wider, 1.0) ** dim) + 32)
+        kept, exact = find(position, kwargs, capacity=most)
         idx, held = finish(rows_of(position, kept, exact, kwargs), room, exact)
         status = jnp.where(jnp.isfinite(position).all(), 0, Status.NONFINITE.value) if kept is None else kept.status
         code = neighbors.error.code | jnp.where(held > room, 1, 0).astype(jnp.uint8) | _code_of(status)
-        fixed = (partition.PartitionError(code), None, room, form, None, None, update)
-        chosen = {"occupancy": held, "measured_in": _matrix_of(kwargs.get("box", jnp.nan), position), "exact": exact}
-        return NeighborList(idx, position, *fixed, kept=kept, **chosen)
+        made = {"idx": idx, "reference_position": position, "error": partition.PartitionError(code)}
+        held, nowhere = jnp.maximum(held, neighbors.occupancy), jnp.full_like(neighbors.measured_in, jnp.inf)
+        return dataclasses.replace(neighbors, **made, occupancy=held, measured_in=nowhere)
 
     def allocate(position: Array, extra_capacity: int = 0, **kwargs: Given) -> NeighborList:
         position = jnp.asarray(position)
@@ -216,6 +224,7 @@ def neighbor_list(
         new = None if kept is None else kept.update(position, box=present)
         moved = new.rebuild_count != kept.rebuild_count if new is not None and kept is not None and skin else jnp.asarray(False)
         measured_in = _matrix_of(kwargs.get("box", jnp.nan), position)
+        moved = moved | jnp.isinf(neighbors.measured_in).any()  # others have chosen the pairs
         if not exact:
             away = jax.vmap(functools.partial(squared, **kwargs))(position, neighbors.reference_position)
             resized = ~jnp.array_equal(measured_in, neighbors.measured_in, equal_nan=True)

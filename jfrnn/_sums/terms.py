@@ -12,13 +12,14 @@ import math
 import weakref
 from collections.abc import Callable, Iterator, Sequence
 from itertools import compress
+from types import FunctionType
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.core import eval_jaxpr
+from jax.core import Tracer, eval_jaxpr
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, jaxpr_as_fun
 from jax.interpreters import partial_eval
 
@@ -133,18 +134,21 @@ _KNOWN: "weakref.WeakKeyDictionary[Any, dict[Any, Derived]]" = weakref.WeakKeyDi
 def _keep(owner: object, derived: "Derived") -> "Derived":
     """Return an equal term that was made for the owner before; otherwise remember this one.
 
-    Where functions have derivatives of their own (`jax.custom_jvp`), which a jaxpr names and does not show, terms are equal only if
-    their derivatives are, too.
+    Where functions have rules for their derivatives (`jax.custom_jvp`), which a jaxpr names and does not show, terms are equal only
+    if the rules are the same functions; those that are made in each trace anew are not.
     """
     closed = derived.term.jaxpr
-    if closed.consts:
+    programs = list(_jaxprs(closed))
+    if closed.consts or any(isinstance(x, Tracer) for each in programs for x in each.consts):
         return derived
-    programs = [closed]
-    if any(equation.primitive.name.startswith("custom_") for inner in _jaxprs(closed) for equation in inner.jaxpr.eqns):
-        programs.append(_pull(derived.term))
+    ruled = [equation for each in programs for equation in each.jaxpr.eqns if equation.primitive.name.startswith("custom_")]
+    rules = [tuple(map(_ByIdentity, _rules(equation.params))) for equation in ruled]
+    if not all(rules):
+        return derived
     key = (
-        tuple(str(each.jaxpr) for each in programs),
+        str(closed.jaxpr),
         tuple(_constants(programs)),
+        tuple(rules),
         jax.tree.structure(derived.needed),
         tuple(jax.tree.leaves(derived.needed)),
         derived.term.labels,
@@ -167,31 +171,49 @@ def _jaxprs(closed: ClosedJaxpr) -> Iterator[ClosedJaxpr]:
 
 def _constants(programs: Sequence[ClosedJaxpr]) -> Iterator[bytes]:
     """Yield what jaxprs know of numbers: of literals their printed form may show a few digits only, of closed-over arrays none."""
-    for closed in (inner for each in programs for inner in _jaxprs(each)):
+    for closed in programs:
         read = [v for equation in closed.jaxpr.eqns for v in equation.invars] + closed.jaxpr.outvars
         yield from (np.asarray(v.val).tobytes() for v in read if isinstance(v, Literal))
         yield from (np.asarray(x).tobytes() for x in closed.consts)
 
 
-def _pull(term: Term) -> ClosedJaxpr:
-    """Trace how cotangents of the summands become those of the operands."""
-    summands = [k for k, x in enumerate(term.summands) if is_moving(x)]
-    flat = sum(term.operands, ())
-    moving = [k for k, x in enumerate(flat) if is_moving(x)]
+# Modules of JAX whose functions hold those of the user.
+_HOLDERS = tuple(
+    f"jax._src.{name}" for name in ("custom_derivatives", "interpreters", "linear_util", "api_util", "core", "util", "tree_util")
+)
 
-    def pull(real: Array, shift: Array, given: list[Array], cotangents: list[Array]) -> Sequence[Array]:
-        def of_moving(*moved: Array) -> list[Array]:
-            now = list(given)
-            for k, x in zip(moving, moved, strict=True):
-                now[k] = x
-            results = term(real, shift, split_operands(now, term.operands))
-            return [results[k] for k in summands]
 
-        return jax.vjp(of_moving, *(given[k] for k in moving))[1](cotangents)
+class _ByIdentity:
+    """A function as part of a key: nothing but itself is equal to it."""
 
-    with without_mesh():
-        like = [term.summands[k] for k in summands]
-        return jax.make_jaxpr(pull)(jax.ShapeDtypeStruct((), np.bool_), term.shift, list(flat), like)
+    def __init__(self, function: object) -> None:
+        self.function = function
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _ByIdentity) and self.function is other.function
+
+    def __hash__(self) -> int:
+        return id(self.function)
+
+
+def _rules(params: dict[str, Any]) -> Iterator[object]:
+    """Yield the functions that parameters of an equation hold, as rules for derivatives."""
+    waiting, seen = list(params.values()), []
+    while waiting:
+        x = waiting.pop()
+        if any(x is other for other in seen):
+            continue
+        seen.append(x)
+        if isinstance(x, FunctionType) and x.__module__.startswith(_HOLDERS):
+            waiting += [cell.cell_contents for cell in x.__closure__ or ()]
+        elif isinstance(x, functools.partial):
+            waiting += [x.func, *x.args, *x.keywords.values()]
+        elif (transforms := getattr(x, "transforms", None)) is not None:  # a function that JAX has wrapped
+            waiting += [getattr(x, "f", None), *(given for transform in transforms for given in transform[1])]
+        elif isinstance(x, tuple | list):
+            waiting += x
+        elif callable(x):
+            yield x
 
 
 class Derived(NamedTuple):

@@ -215,6 +215,9 @@ def test_lists_of_other_functions(form):
         updated, own = jax.jit(each.update)(x, old), each.allocate(x)
         assert int(updated.error.code) == 0
         assert pairs_of(updated.idx, N, form) == pairs_of(own.idx, N, form)
+        carried, _ = jax.lax.scan(lambda nbrs, _, each=each: (each.update(x, nbrs), None), old, None, length=2)
+        assert pairs_of(carried.idx, N, form) == pairs_of(own.idx, N, form)
+        assert pairs_of(carried.update(x).idx, N, form) == pairs_of(old.idx, N, form)
     for other in set(FORMATS) - {form}:
         refuses(ValueError, "allocate anew", jax_md.neighbor_list(None, LENGTHS, CUTOFF, SKIN, format=other).update, x, old)
 

@@ -100,3 +100,52 @@ def test_what_a_function_knows_may_change(monkeypatch, backend):
     after = both()
     np.testing.assert_allclose(after[0], 7 * before[0], rtol=1e-5)
     np.testing.assert_allclose(after[1], 5 * before[1], rtol=1e-5)
+
+
+def test_rules_that_cannot_be_followed_stop_no_sum():
+    """Nor are they asked before a derivative is: of loops, of what raises, or with a value of the program."""
+    x = jnp.asarray(np.random.default_rng(0).random((20, 3)), jnp.float32)
+
+    @jax.custom_vjp
+    def doubled(square):
+        return square * 2
+
+    def backward(*_):
+        raise NotImplementedError
+
+    doubled.defvjp(lambda square: (doubled(square), None), backward)
+
+    def by_a_loop(r, i, j):
+        step = lambda k, root: 0.5 * (root + (r @ r) / root)  # noqa: E731
+        return jax.nn.relu(0.5 - jax.lax.while_loop(lambda at: at[0] < 9, lambda at: (at[0] + 1, step(*at)), (0, r @ r + 0.1))[1])
+
+    def of_a_program(x, scale):
+        rule = jax.custom_jvp(lambda square: 2 * square)
+        rule.defjvp(lambda primals, tangents: (rule(*primals), scale * tangents[0]))
+        return jfrnn.pair_sum(lambda r, i, j: rule(r @ r), x, 0.5, backend="brute")
+
+    plain = jfrnn.pair_sum(lambda r, i, j: 2 * (r @ r), x, 0.5, backend="brute")
+    np.testing.assert_allclose(jfrnn.pair_sum(lambda r, i, j: doubled(r @ r), x, 0.5, backend="brute"), plain, rtol=1e-6)
+    np.testing.assert_allclose(jax.jit(of_a_program)(x, 2.0), plain, rtol=1e-6)
+    near = jfrnn.pair_sum(lambda r, i, j: jnp.maximum(0.5 - jnp.sqrt(r @ r), 0), x, 0.5, backend="brute")
+    np.testing.assert_allclose(jfrnn.pair_sum(by_a_loop, x, 0.5, backend="brute"), near, rtol=1e-4)
+
+
+def test_rules_in_rules_may_change():
+    x, scale = jnp.asarray(np.random.default_rng(0).random((9, 3)), jnp.float32), [1.0]
+
+    def fn(r, i, j):
+        inner = jax.custom_jvp(lambda square: square * square / 2)
+        inner.defjvp(lambda primals, tangents: (inner(*primals), scale[0] * primals[0] * tangents[0]))
+        outer = jax.custom_jvp(lambda square: square**3 / 6)
+        outer.defjvp(lambda primals, tangents: (outer(*primals), inner(primals[0]) * tangents[0]))
+        return outer(r @ r)
+
+    def hessian(fn):
+        return jax.jacfwd(jax.grad(lambda x: jfrnn.pair_sum(fn, x, 0.5, backend="brute").sum()))(x)
+
+    before = hessian(fn)
+    scale[0] = 5.0
+    after = hessian(fn)
+    assert float(jnp.abs(after - before).max()) > 0.01
+    np.testing.assert_array_equal(after, hessian(lambda r, i, j: fn(r, i, j)))
