@@ -134,6 +134,9 @@ def _read(path: Path, dim: int) -> dict[str, np.ndarray]:
         raise SceneError(f"initial {path}: cannot be read ({reason}); expected a file .npz or .csv") from error
     except (ValueError, TypeError, AttributeError, EOFError, BadZipFile) as error:
         raise SceneError(f"{path}: cannot be read: {error}") from error
+    unknown = sorted(given.keys() - {"positions", "velocities", "masses"})
+    if unknown:
+        raise SceneError(f"{path}: {', '.join(unknown)} means nothing; expected arrays positions, velocities, masses")
     if "positions" not in given:
         raise SceneError(f"{path}: no positions; expected arrays positions, velocities, masses, or columns x, y, vx, vy, m")
     return given
@@ -142,5 +145,15 @@ def _read(path: Path, dim: int) -> dict[str, np.ndarray]:
 def _columns(table: np.ndarray, axes: str) -> dict[str, np.ndarray]:
     names = table.dtype.names or ()
     wanted = {"positions": list(axes), "velocities": [f"v{axis}" for axis in axes]}
+    known = [*axes, *wanted["velocities"], "m"]
+    unknown = [name for name in names if name not in known]
+    some = [name for name in wanted["velocities"] if name in names]
+    if unknown or len(some) not in (0, len(axes)):
+        which = (
+            f"{', '.join(unknown)} means nothing"
+            if unknown
+            else f"of {', '.join(wanted['velocities'])}, there is {', '.join(some)} alone"
+        )
+        raise ValueError(f"{which}; columns are {', '.join(known)}")
     given = {key: np.stack([table[c] for c in columns], axis=1) for key, columns in wanted.items() if set(columns) <= set(names)}
     return given | ({"masses": table["m"]} if "m" in names else {})

@@ -15,7 +15,7 @@ from jfrnn.sph.errors import SceneError
 from jfrnn.sph.forces import density_and_pressure
 from jfrnn.sph.kernels import KERNELS
 from jfrnn.sph.pairs import Neighbors, reach
-from jfrnn.sph.particles import Force, Model, State, active
+from jfrnn.sph.particles import Force, Model, State, active, wrapped
 
 __all__ = ["begin", "beside", "courant", "density_and_pressure", "energies", "list_neighbors", "make_model", "make_state", "step"]
 
@@ -183,7 +183,8 @@ def step(model: Model, s: State, dt: Array, nbrs: Neighbors) -> tuple[State, Nei
 
 def _let_go(model: Model, s: State, gone: Array, lower: Array, upper: Array) -> State:
     """Return the state without the particles of the fluid that are outside of the corners [m]; they rest where they left."""
-    outside = jnp.any((s.x < lower) | (s.x > upper), axis=1)
+    x = wrapped(model, s.x)
+    outside = jnp.any((x < lower) | (x > upper), axis=1)
     if model.wall is not None:
         outside = outside & ~model.wall
     if model.enters is not None:
@@ -254,7 +255,7 @@ def _symplectic(model: Model, s: State, dt: Array, nbrs: Neighbors) -> tuple[Sta
     s = s._replace(v=s.v + dt / 2 * s.a)
     moved = s.x + dt * _transport_velocity(model, s)
     s = s._replace(x=moved) if s.solid is None else solids.keep_out(model, s, moved, s.v, dt, forces.are_resting(model, s))
-    s = _bounce(model, s)
+    s = _bounce(model, s._replace(time=s.time + dt))
     nbrs = _update(model, s, nbrs)
     s = _evaluate(model, s, nbrs, dt)
     return s._replace(v=s.v + dt / 2 * s.a), nbrs
@@ -271,7 +272,7 @@ def _midpoint(model: Model, s: State, dt: Array, nbrs: Neighbors) -> tuple[State
         at = at._replace(a=a, w=_besides(model, w, dt))
         part = share * dt
         moved = base.x + part * _transport_velocity(model, at)
-        at = at._replace(x=moved, v=base.v + part * a, **_carry(model, base, at, rho, inverse, nbrs, part))
+        at = at._replace(x=moved, v=base.v + part * a, time=base.time + part, **_carry(model, base, at, rho, inverse, nbrs, part))
     return _bounce(model, at), nbrs
 
 

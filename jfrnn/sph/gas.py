@@ -96,7 +96,7 @@ def step(model: GasModel, s: State, dt: Array, nbrs: Neighbors = None) -> tuple[
     x, h = s.x + dt * middle, h * jnp.exp(dt * growth)
     for _ in range(PASSES):
         h = improve(model, h, sum_density(model, x, h))
-    s = _evaluate(model, s._replace(x=x, v=middle + dt / 2 * s.a), u + dt / 2 * heating, h)
+    s = _evaluate(model, s._replace(x=x, v=middle + dt / 2 * s.a, time=s.time + dt), u + dt / 2 * heating, h)
     now = thermal(s)
     return s._replace(v=middle + dt / 2 * s.a, gas=now._replace(u=u + dt / 2 * now.heating)), None
 

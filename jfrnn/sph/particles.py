@@ -196,6 +196,16 @@ def active(model: Flow, s: State) -> Array | None:
     return ~s.gone if entered is None else entered & ~s.gone
 
 
+def wrapped(model: Flow, x: Array, about: Array | None = None) -> Array:
+    """Return positions [n, d] in the periodic box, where there is one; or of their images those that are nearest to a point [d]."""
+    box = getattr(model, "box", None)  # a gas has none
+    if box is None:
+        return x
+    low = box.origin if about is None else about - box.vectors / 2
+    turns = jnp.floor((x - low) / box.vectors)
+    return jnp.where(jnp.asarray(box.periodic), x - turns * box.vectors, x)
+
+
 def mass_there(model: Flow, s: State) -> Array:
     """Return masses of the fluid [kg], shape [n]: 0 of dummies of walls, and of particles that take no part."""
     there = active(model, s)

@@ -11,7 +11,7 @@ from jfrnn.sph import solids, solver
 from jfrnn.sph.errors import SceneError
 from jfrnn.sph.forces import fluid
 from jfrnn.sph.pairs import Pair, Values, total
-from jfrnn.sph.particles import Flow, Model, State, active, mass_there, own_acceleration
+from jfrnn.sph.particles import Flow, Model, State, active, mass_there, own_acceleration, wrapped
 
 Probe = Callable[[Any, State], Any]
 """(model, state) -> numbers, arrays, or a dict of them; inside jit."""
@@ -61,7 +61,8 @@ def flow_through(point: Sequence[float], normal: Sequence[float], width: float) 
         if not width > 0 or not across.any():
             raise SceneError(f"normal and width must not be 0, got {normal!r} and {width!r}.")
         n = jnp.asarray(across / np.linalg.norm(across), s.x.dtype)
-        near = jnp.abs((s.x - jnp.asarray(at, s.x.dtype)) @ n) < width / 2
+        point_there = jnp.asarray(at, s.x.dtype)
+        near = jnp.abs((wrapped(model, s.x, point_there) - point_there) @ n) < width / 2
         return jnp.sum(jnp.where(near, mass_there(model, s) * (s.v @ n), 0)) / width
 
     return probe
@@ -77,9 +78,11 @@ def surface_height(place: Sequence[float], radius: float) -> Probe:
 
     def probe(model: Flow, s: State) -> Array:
         at = _check_vector("place", place, s.x.shape[1] - 1)
-        aside = jnp.linalg.norm(s.x[:, :-1] - jnp.asarray(at, s.x.dtype), axis=1)
+        x = wrapped(model, s.x)
+        of_place = jnp.asarray([*at, 0], s.x.dtype)
+        aside = jnp.linalg.norm((wrapped(model, x, of_place) - of_place)[:, :-1], axis=1)
         there = (aside < radius) & (mass_there(model, s) > 0)
-        return jnp.max(jnp.where(there, s.x[:, -1], -jnp.inf))
+        return jnp.max(jnp.where(there, x[:, -1], -jnp.inf))
 
     return probe
 
@@ -104,7 +107,7 @@ def force_on_walls(about: Sequence[float] | None = None) -> Probe:
         moved = mass_there(model, s)
         if model.enters is not None and model.guided is not None:
             moved = jnp.where(s.time < model.enters + model.guided, 0, moved)
-        return _force_and_torque(-moved[:, None] * (a if own is None else a - own), s.x, about)
+        return _force_and_torque(-moved[:, None] * (a if own is None else a - own), wrapped(model, s.x), about)
 
     return probe
 

@@ -67,6 +67,8 @@ def latest(folder: Path, scene: Scene) -> tuple[State, int] | None:
 def check_same(about: dict[str, Any], folder: Path) -> None:
     """Remember what the run is, or refuse a folder that holds another one, or that cannot be written."""
     path = _take(folder) / "run.json"
+    if not path.exists() and any(folder.glob("snapshots/*.npz")):
+        raise SceneError(f"{folder}: holds snapshots, but no run.json that says of what; take another folder, or remove it")
     text = json.dumps(about | {"units": UNITS, "made_by": origin.tell()}, indent=1, sort_keys=True)
     if not path.exists():
         path.write_text(text)
@@ -74,7 +76,7 @@ def check_same(about: dict[str, Any], folder: Path) -> None:
     try:
         there = dict(json.loads(path.read_text()))
     except (TypeError, ValueError) as error:
-        raise SceneError(f"{path}: says no run ({error}); take another folder, or remove it") from error
+        raise SceneError(f"{path}: says no run ({error}); take another folder, or remove {folder}") from error
     asked = json.loads(json.dumps(about))
     there = {key: value for key, value in there.items() if key not in ("units", "made_by")}
     if _goes_on(there, asked):
@@ -180,10 +182,15 @@ def _write_vtk(arrays: dict[str, np.ndarray], scene: Scene, there: np.ndarray, v
 
     flat = ((0, 0), (0, 3 - scene.dim))
     cloud = pyvista.PolyData(np.pad(arrays["x"][there], flat))
-    cloud.point_data["velocity"] = np.pad(arrays["v"][there], flat)
-    for name, value in values.items():
-        cloud.point_data[name] = value[there]
+    arrays_there = {"velocity": np.pad(arrays["v"][there], flat)} | {name: value[there] for name, value in values.items()}
     if scene.wall is not None:
-        cloud.point_data["wall"] = scene.wall[there].astype(np.uint8)
+        arrays_there["wall"] = scene.wall[there].astype(np.uint8)
+    for name, value in arrays_there.items():
+        if len(value):
+            cloud.point_data[name] = value
+        else:  # pyvista takes no empty array
+            empty = pyvista.convert_array(np.zeros((1, *value.shape[1:]), value.dtype), name)
+            empty.SetNumberOfTuples(0)
+            cloud.GetPointData().AddArray(empty)
     cloud.field_data["time"] = [float(str(arrays["time"]))]
     cloud.save(path)

@@ -46,7 +46,7 @@ def begin(scene: FluidScene, x: Array, angle: Array | None = None) -> Beside | N
     if solid is None:
         return None
     vertices, faces, cutoff = jnp.asarray(solid.vertices, x.dtype), jnp.asarray(solid.faces), _reach(scene)
-    turning = turning_of(scene, x.dtype)
+    turning, goes_on = turning_of(scene, x.dtype), angle is not None
     angle = jnp.zeros((), x.dtype) if turning is not None and angle is None else angle
     at = into_frame(x, turning, angle)
     tri = jfrnn.search_triangles(at, vertices, faces, cutoff)
@@ -56,7 +56,8 @@ def begin(scene: FluidScene, x: Array, angle: Array | None = None) -> Beside | N
             "solid must be a closed mesh whose faces run counterclockwise as seen from the fluid: they run through one side more "
             "often one way than the other. If corners are written once per triangle, as in STL files, join them first."
         )
-    _refuse(scene, np.asarray(signed.mask & (signed.distance < GAP / 2 * scene.spacing)))
+    if not goes_on:  # of a run that goes on, who is in the way of a turning wall has left or is not there yet
+        _refuse(scene, np.asarray(signed.mask & (signed.distance < GAP / 2 * scene.spacing)))
     corners = np.asarray(vertices)[solid.faces]
     asked = sight.points_to_ask(corners, cutoff)
     on_wall = jfrnn.search_triangles(asked[0], vertices, faces, cutoff)
@@ -327,4 +328,8 @@ def clearance(scene: Scene, s: State) -> np.ndarray | None:
     at = into_frame(s.x, turning_of(scene, s.x.dtype), s.solid.angle)
     signed = s.solid.tri.update(at).signed_distance(at)
     free = np.asarray(signed.mask) if scene.wall is None else np.asarray(signed.mask) & ~scene.wall
+    if s.gone is not None:
+        free = free & ~np.asarray(s.gone)
+    if scene.enters is not None:
+        free = free & (np.asarray(s.time) >= scene.enters)
     return np.where(free, np.asarray(signed.distance), np.inf)

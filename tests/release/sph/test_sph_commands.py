@@ -126,6 +126,8 @@ def test_no_number_of_a_scene_ends_in_anything_but_a_sentence(name):
         ("empty.npz", b"", "{}: cannot be read: "),
         ("empty.csv", b"\n", "{}: cannot be read: it is empty"),
         ("words.csv", b"x,y\n1,a\n", "{}: positions must be finite; particle 0 is not"),
+        ("speeds.csv", b"x,y,vx\n1,1,0\n", "{}: cannot be read: of vx, vy, there is vx alone; columns are x, y, vx, vy, m"),
+        ("depth.csv", b"x,y,z\n1,1,0\n", "{}: cannot be read: z means nothing; columns are x, y, vx, vy, m"),
         ("masses.csv", b"x,y,m\n1,1,0\n", "{}: expected at least one particle, and masses above 0"),
     ],
 )
