@@ -25,7 +25,8 @@ def draw(scene: Scene, there: np.ndarray, x: np.ndarray, v: np.ndarray, time: fl
     aslant = scene.solid is not None and scene.dim == 3
     lower, upper = picture_bounds(scene)
     wide, high = (upper - lower)[[0, -1]]
-    figure = Figure(figsize=(7.0, 6.0 if aslant else min(max(7.0 * high / max(wide, 1e-300), 2.5) + 0.8, 9.0)), layout="constrained")
+    tall = 6.0 if aslant else min(max(7.0 * high / max(wide, 1e-300), 2.5) + 0.8, 9.0)
+    figure = Figure(figsize=(7.0, tall), layout="constrained")
     axes, scale = figure.add_subplot(), ScalarMappable(Normalize(0, top_speed or 1.0), "viridis")
     if aslant:
         axes.imshow(view.render(scene, x[there], scale.to_rgba(np.linalg.norm(v[there], axis=1))[:, :3], time))
