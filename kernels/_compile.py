@@ -7,6 +7,7 @@ halves.
 """
 
 import atexit
+import contextlib
 import functools
 import hashlib
 import os
@@ -18,7 +19,6 @@ import threading
 import weakref
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -122,6 +122,8 @@ def begin(program: Program, device: str = "cpu") -> Future[Path] | None:
     name, build = _name(program, found, None), _builder(program, found, None)
     if _is_whole(kernel_folder() / _FOLDER / name):
         return None
+    with contextlib.suppress(RuntimeError):  # the job meets it again
+        _find_folder()  # in the thread of who asks, whom the warning names
     return _jobs.begin((kernel_folder(), name), functools.partial(_make, program, build, name))
 
 
@@ -204,10 +206,33 @@ def _make(program: Program, build: Build, name: str) -> Path:
     try:
         return _compile(program, build, kernel_folder() / _FOLDER / name)
     except OSError:
-        with _moving:
-            if not keeps_no_programs():
-                notes.append(temporary_folder())
+        _move()
         return _compile(program, build, kernel_folder() / _FOLDER / name)
+
+
+def _find_folder() -> None:
+    """Move to a temporary folder where files cannot be kept."""
+    try:
+        _check_folder(kernel_folder() / _FOLDER)
+    except OSError:
+        _move()
+
+
+def _check_folder(folder: Path) -> None:
+    """Raise an OSError where no files can be written."""
+    folder.mkdir(parents=True, exist_ok=True)
+    tempfile.TemporaryFile(dir=folder).close()
+
+
+def _move() -> None:
+    """Let programs be kept for this process alone, and users be warned of it.
+
+    Raises:
+        RuntimeError: There is no folder that can be written.
+    """
+    with _moving:
+        if not keeps_no_programs():
+            notes.append(temporary_folder())
 
 
 def temporary_folder() -> str:
@@ -271,8 +296,7 @@ def _compile(program: Program, build: Build, path: Path) -> Path:
         OSError: It cannot be written.
         RuntimeError: It does not compile.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    tempfile.TemporaryFile(dir=path.parent).close()  # before the compiler has worked for nothing
+    _check_folder(path.parent)  # before the compiler has worked for nothing
     with _new_folder(path.parent) as folder:
         source = folder / f"program.{'cu' if program.cuda else 'cpp'}"
         source.write_text(program.text, "utf-8")
@@ -288,7 +312,7 @@ def _compile(program: Program, build: Build, path: Path) -> Path:
     return path
 
 
-@contextmanager
+@contextlib.contextmanager
 def _new_folder(place: Path) -> Iterator[Path]:
     """Make a folder for a compiler, which is gone afterwards.
 
