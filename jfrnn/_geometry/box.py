@@ -13,6 +13,7 @@ from jax.core import Tracer
 from jfrnn._geometry.reduced import count_cells, short_vectors
 from jfrnn._tracing import Given, as_array, as_dtype, own_transfers
 
+_FLAT = 1e-12  # a cell less high, squared, beside its edges of length 1, is what rounding leaves of none
 _SINGULAR = 1e-9  # determinants below may be those of dependent rows
 Numbers = Any  # an array of NumPy or JAX, concrete or traced
 
@@ -239,7 +240,7 @@ def _cell_of(lengths: Given, angles: Given) -> Numbers:
     else:
         along = (cosines[0] - cosines[1] * gamma) / height
         square = 1 - cosines[1] ** 2 - along**2
-        if xp is np and not square > 0:
+        if xp is np and not square > _FLAT:
             raise ValueError(f"angles must be those of a cell, each less than the sum of the others, got {angles}.")
         rows = [[1 + nothing, nothing, nothing], [gamma, height, nothing], [cosines[1], along, xp.sqrt(square)]]
     return xp.stack([xp.stack(row) for row in rows]).astype(sizes.dtype) * sizes[:, None]
@@ -300,6 +301,15 @@ def check_box_values(box: Box) -> None:
     bad = np.linalg.matrix_rank(scaled) < flags.sum(axis=-1)
     if bad.any():
         raise ValueError(f"periodic lattice vectors must be linearly independent, got the rows {_tell_bad(vectors, bad, box)}.")
+
+
+def check_box_range(box: Box, dtype: np.dtype) -> None:
+    """Raise if known values overflow in the dtype of positions, or the reciprocal of an edge does."""
+    most = float(np.finfo(dtype).max) / 8
+    for name, value in (("lengths_or_matrix", box.vectors), ("origin", box.origin)):
+        if isinstance(value, np.ndarray) and (bad := np.abs(value) > most).any():
+            told = _tell_bad(value, bad, box)
+            raise ValueError(f"{name} must not exceed {most:.2g}, as positions are {dtype}, got {told}: choose another unit of length.")
 
 
 def _tell_bad(values: np.ndarray, bad: np.ndarray, box: Box) -> str:

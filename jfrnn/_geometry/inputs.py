@@ -12,7 +12,7 @@ from jax.core import Tracer
 from jax.tree_util import KeyPath
 
 from jfrnn._geometry.batch import Batch
-from jfrnn._geometry.box import Box
+from jfrnn._geometry.box import Box, check_box_range
 from jfrnn._geometry.cutoffs import RANGE_OF, RULES, SUM, TABLE, Radii, is_radius
 from jfrnn._tracing import Given, Tree, as_array, as_dtype, gather, make_on_host, on_device, refuse_forks
 
@@ -308,6 +308,7 @@ def check_box(box: object, positions: Array, like: Box | None = None) -> Box | N
     if like is not None and _kind_of(box) != _kind_of(like):
         was, came = (_kind_of(b) for b in (like, box))
         raise ValueError(f"box must be of the kind with which the list was made ({was}), got {came}.")
+    check_box_range(box, positions.dtype)
     return box if any(box.periodic) or box.fractional or box.per_system else None
 
 

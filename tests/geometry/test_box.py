@@ -424,6 +424,19 @@ def test_sums_in_the_box_of_a_list_have_its_images_and_chunks_raise_both():
     assert int(jfrnn.count(u, 0.9, box=nbrs.box)[0]) > int(sums[0])  # a box that is known has as many as a cutoff needs
 
 
+@pytest.mark.parametrize("backend", ["warp", "jax"])
+def test_a_box_beyond_the_numbers_of_its_dtype(backend):
+    """A reciprocal of an edge that is not a normal number is flushed to 0."""
+    x = np.array([[0.1, 0.5], [0.9, 0.5]], np.float32)
+    for name, box in (
+        ("lengths_or_matrix", jfrnn.Box([2.0**126, 1.0])),
+        ("lengths_or_matrix", jfrnn.Box([[1e39, 0.0], [0.0, 1.0]])),
+        ("origin", jfrnn.Box([1.0, 1.0], origin=[1e39, 0.0])),
+    ):
+        refuses(ValueError, f"{name} must not exceed 4.3e\\+37, as positions are float32", lambda box=box: jfrnn.count(x, 0.3, box=box))
+    assert jfrnn.count(x, 0.3, box=jfrnn.Box([2.0**124, 1.0]), backend=backend).tolist() == [0, 0]
+
+
 def test_cells_from_lengths_and_angles():
     """As ASE makes them; right angles are exact, in 2D, too, and traced ones alike."""
     Cell = pytest.importorskip("ase.cell").Cell
@@ -437,6 +450,7 @@ def test_cells_from_lengths_and_angles():
     for error, match, make in (
         (ValueError, "Box.from_parameters", lambda: jfrnn.Box([1.0, 2.0, 3.0, 90.0, 90.0, 90.0])),
         (ValueError, "less than the sum of the others", lambda: jfrnn.Box.from_parameters([1.0, 2.0, 3.0], [10.0, 20.0, 150.0])),
+        (ValueError, "less than the sum of the others", lambda: jfrnn.Box.from_parameters([1.0] * 3, [60.0, 60.0, 120.0])),  # flat
         (ValueError, "between 0 and 180", lambda: jfrnn.Box.from_parameters([1.0, 2.0, 3.0], [10.0, 20.0, 180.0])),
         (ValueError, r"lengths and angles must have shape \[3\] each", lambda: jfrnn.Box.from_parameters([1.0, 2.0, 3.0], 90.0)),
     ):
