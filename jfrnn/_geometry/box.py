@@ -309,7 +309,9 @@ def check_box_range(box: Box, dtype: np.dtype) -> None:
     for name, value in (("lengths_or_matrix", box.vectors), ("origin", box.origin)):
         if isinstance(value, np.ndarray) and (bad := np.abs(value) > most).any():
             told = _tell_bad(value, bad, box)
-            raise ValueError(f"{name} must not exceed {most:.2g}, as positions are {dtype}, got {told}: choose another unit of length.")
+            raise ValueError(
+                f"{name} must not exceed {most:.2g}, as positions are {dtype}, got {told}: choose another unit of length."
+            )
 
 
 def _tell_bad(values: np.ndarray, bad: np.ndarray, box: Box) -> str:

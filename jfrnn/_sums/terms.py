@@ -234,6 +234,8 @@ def make_term(
 ) -> Derived:
     """Trace a summand that closes over nothing, and drop the operands that it does not need."""
     closed = _jaxpr_of(summand, operands, shift)
+    if any(isinstance(x, Tracer) for x in closed.consts):
+        raise ValueError(_CLOSED)
     always = [True, True] + [False] * sum(map(len, operands))
     jaxpr, used = partial_eval.dce_jaxpr(closed.jaxpr, [True] * len(closed.jaxpr.outvars), always)
     needed = split_operands(used[2:], operands)
@@ -268,6 +270,7 @@ def is_moving(x: Given) -> bool:
 def tangent(term: Term, moving: Groups) -> Derived:
     """Make the term of the tangents of the float summands; operands are all operands, then the tangents of the moving ones."""
     tangents = choose(term.operands, moving)
+    _refuse_constants(term.jaxpr.jaxpr, [False, False, *sum(moving, ())])
 
     def summand(real: Array, shift: Array, operands: Groups) -> list[Array]:
         primals, moves = _halves(operands, term.operands)
@@ -288,6 +291,26 @@ def tangent(term: Term, moving: Groups) -> Derived:
     )
     marking = term.marking | {of_tangent[label] for label in term.marking & of_tangent.keys()}
     return make_term(summand, join(term.operands, tangents), term.shift, (mine, theirs), totals, marks, marking)
+
+
+_CLOSED = (
+    "fn calls a function with a rule for its derivative (jax.custom_jvp or jax.custom_vjp) that closes over an array which is "
+    "being traced or differentiated: hand that array over as an argument of the function."
+)
+
+
+def _refuse_constants(jaxpr: Jaxpr, moving: Sequence[bool]) -> None:
+    """Raise where a function with a rule of its own closes over what moves: no rule knows the tangent of that, which would be 0."""
+    moved = set(compress(jaxpr.invars, moving))
+    for equation in jaxpr.eqns:
+        name, params = equation.primitive.name, equation.params
+        moves = [not isinstance(v, Literal) and v in moved for v in equation.invars]
+        if name.startswith("custom_") and any(moves[: params.get("num_consts", 0)]):
+            raise ValueError(_CLOSED)
+        if name in ("jit", "pjit"):
+            _refuse_constants(params["jaxpr"].jaxpr, moves)
+        if any(moves) and name != "stop_gradient":
+            moved.update(v for v in equation.outvars if is_moving(v.aval))
 
 
 class Transposed(NamedTuple):

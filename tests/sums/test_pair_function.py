@@ -149,3 +149,22 @@ def test_rules_in_rules_may_change():
     after = hessian(fn)
     assert float(jnp.abs(after - before).max()) > 0.01
     np.testing.assert_array_equal(after, hessian(lambda r, i, j: fn(r, i, j)))
+
+
+def of_a_rule(x, scale, backend):
+    """A sum of (scale - r^2)^3 by a function that closes over `scale`, as its rule does."""
+    rule = jax.custom_jvp(lambda square: (scale - square) ** 3)
+    rule.defjvp(lambda primals, tangents: (rule(*primals), -3 * (scale - primals[0]) ** 2 * tangents[0]))
+    return jfrnn.pair_sum(lambda r, i, j: rule(r @ r), x, 0.5, backend=backend).sum()
+
+
+@pytest.mark.parametrize("backend", ["warp", "jax"])
+def test_rules_that_close_over_what_moves_are_refused(backend):
+    """Such a rule knows no tangent of what it closes over, which JAX takes for 0."""
+    x = jnp.asarray(np.random.default_rng(0).random((9, 3)), jnp.float32)
+    scale, work = jnp.float32(0.25), functools.partial(of_a_rule, backend=backend)
+    np.testing.assert_allclose(jax.jit(work)(x, scale), work(x, scale), rtol=1e-6)
+    assert np.isfinite(jax.grad(work)(x, scale)).all()
+    for derivative in (jax.grad(work, 1), jax.jit(jax.grad(work, 1)), jax.grad(jax.jit(work), 1), jax.jit(jax.grad(work))):
+        with pytest.raises(ValueError, match=r"fn calls a function with a rule for its derivative .* hand that array over"):
+            derivative(x, scale)
