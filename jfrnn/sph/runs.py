@@ -1,6 +1,7 @@
 """Run a scene: in chunks of steps, a snapshot, a line of energies and a picture after each, from the last snapshot on."""
 
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
@@ -81,7 +82,7 @@ def run(
     Args:
         scene: The scene.
         folder: Gets run.json, energies.csv, probes.csv, snapshots/STEP.npz and .vtp, NAME.pvd, the series of those for ParaView,
-            frames/STEP.png, NAME.gif; and, if asked for, NAME.vtkhdf.
+            frames/STEP.png, NAME.gif; if asked for, NAME.vtkhdf; and lock, an empty file that a run holds as long as it goes on.
         how: Options.
         force: As in `make_model`. It is no part of run.json: who goes on with a run gives the same.
         probes: Functions (model, state) -> numbers, arrays or dicts of them, inside jit, whose values are columns of probes.csv.
@@ -90,7 +91,7 @@ def run(
         The last state.
 
     Raises:
-        SceneError: The folder holds another run, or the scene cannot be run.
+        SceneError: The folder holds another run, another run writes there now, or the scene cannot be run.
         DivergedError: A particle is not finite, or went through a wall.
         KeyboardInterrupt: Ctrl-C came.
     """
@@ -98,11 +99,12 @@ def run(
     check_names(probes or {})
     if how.hdf:
         series.check_library()
-    with hold_interrupts() as stopped:
+    with hold_interrupts() as stopped, ExitStack() as held:
         try:
             model, first = make_model(scene, dtype, force=force), make_state(scene, dtype)  # what is refused leaves no folder
         except SceneError as error:
             raise SceneError(f"scene {scene.name!r}: {error}") from error
+        held.enter_context(snapshots.hold(folder))
         snapshots.check_same(_describe(scene, how, dtype), folder)
         saved = snapshots.latest(folder / "snapshots", scene)
         s, step = saved or (first, 0)

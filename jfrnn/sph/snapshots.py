@@ -4,6 +4,8 @@ import errno
 import json
 import os
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile
@@ -64,9 +66,29 @@ def latest(folder: Path, scene: Scene) -> tuple[State, int] | None:
     return s._replace(solid=kind_of(scene).beside(scene, s.x, angle)), int(paths[-1].stem)
 
 
+@contextmanager
+def hold(folder: Path) -> Iterator[None]:
+    """Make the folder of a run, and let no other run write there; the system lets go of it with the process, however that ends.
+
+    Raises:
+        SceneError: Another run holds it, or it cannot be written.
+    """
+    with (_take(folder) / "lock").open("a") as file:
+        with suppress(ImportError):  # not there on Windows
+            import fcntl
+
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                raise SceneError(f"{folder}: another run writes there now; wait until it ends, or take another folder") from error
+            except OSError:  # of a file system without locks
+                pass
+        yield
+
+
 def check_same(about: dict[str, Any], folder: Path) -> None:
-    """Remember what the run is, or refuse a folder that holds another one, or that cannot be written."""
-    path = _take(folder) / "run.json"
+    """Remember what the run is, or refuse a folder that holds another one."""
+    path = folder / "run.json"
     if not path.exists() and any(folder.glob("snapshots/*.npz")):
         raise SceneError(f"{folder}: holds snapshots, but no run.json that says of what; take another folder, or remove it")
     text = json.dumps(about | {"units": UNITS, "made_by": origin.tell()}, indent=1, sort_keys=True)

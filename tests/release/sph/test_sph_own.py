@@ -1,6 +1,7 @@
 """What users bring and take: own forces, outflow, probes, a run that goes on for longer."""
 
 import json
+import subprocess
 import sys
 from dataclasses import replace
 
@@ -176,6 +177,17 @@ def test_probes_of_another_table_are_refused_before_the_run_goes_on(tmp_path):
     longer, more, fewer = replace(scene, duration=0.2), replace(how, frames=2), {"second": probes["second"]}
     refuses(SceneError, r"has the columns .*,second, and this run .*\]", sph.run, longer, tmp_path, more, probes=fewer)
     assert (tmp_path / "energies.csv").read_bytes() == there
+
+
+def test_a_folder_is_of_one_run_at_a_time_until_its_process_ends(tmp_path):
+    """Another process holds it as a run does, and is killed."""
+    how = sph.How(frames=1, pictures=False)
+    code = "import fcntl; file = open('lock', 'a'); fcntl.flock(file, fcntl.LOCK_EX); print(flush=True); input()"
+    with subprocess.Popen([sys.executable, "-c", code], cwd=tmp_path, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
+        other.stdout.readline()
+        refuses(SceneError, f"^{tmp_path}: another run writes there now; wait until it ends, or take", sph.run, FREE, tmp_path, how)
+        other.kill()
+    sph.run(FREE, tmp_path, how)
 
 
 FLOWING = scene_of(
