@@ -1,6 +1,7 @@
 """The first model and state of a scene, and the one place that tells the two kinds of flows apart: a fluid, and a gas."""
 
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any, Protocol, overload
 
 import jax
@@ -48,9 +49,11 @@ def choose_dtype(dtype: Any) -> type:  # noqa: ANN401
         SceneError: It is none, or float64 where JAX has it not.
     """
     widest = np.float64 if jax.config.read("jax_enable_x64") else np.float32
-    asked = np.dtype(widest if dtype is None else dtype)
-    if asked not in (np.float32, np.float64):
-        raise SceneError(f"dtype must be float32 or float64, got {asked}.")
+    asked = None
+    with suppress(TypeError, ValueError):  # where NumPy knows no such dtype
+        asked = np.dtype(widest if dtype is None else dtype)
+    if asked is None or asked not in (np.float32, np.float64):
+        raise SceneError(f"dtype must be float32 or float64, got {dtype if asked is None else asked}.")
     if asked == np.float64 and widest == np.float32:
         raise SceneError('dtype float64 needs jax.config.update("jax_enable_x64", True) before; or take float32.')
     return asked.type

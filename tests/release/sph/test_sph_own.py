@@ -312,6 +312,12 @@ def test_a_mistake_in_how_a_scene_is_run_is_named(told, message):
     refuses(SceneError, message, sph.How, **told)
 
 
+@pytest.mark.parametrize("dtype", ["foo", "float16"])
+def test_a_dtype_that_is_none_is_named(tmp_path, dtype):
+    refuses(SceneError, f"dtype must be float32 or float64, got {dtype}", sph.run, FREE, tmp_path / "out", sph.How(dtype=dtype))
+    assert not (tmp_path / "out").exists()
+
+
 @pytest.mark.parametrize(
     ("more", "message"),
     [
