@@ -1,6 +1,7 @@
 """What a scene is made of once it is in JAX: a model, which stays, and a state, which moves. Both are pytrees."""
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field, fields
 from typing import ClassVar, NamedTuple
 
@@ -213,10 +214,13 @@ def mass_there(model: Flow, s: State) -> Array:
 
 
 def own_acceleration(model: Flow, s: State) -> Array | None:
-    """Return what the own force of a model says [m/s²], shape [n, d]; None where it has none, a `SceneError` if shapes differ."""
+    """Return what the own force of a model says [m/s²], shape [n, d]; None where it has none, a `SceneError` if it says none."""
     if model.force is None:
         return None
-    a = jnp.asarray(model.force(s))
-    if a.shape != s.x.shape:
-        raise SceneError(f"force must return accelerations [m/s²] of shape {list(s.x.shape)}, got {list(a.shape)}.")
+    given, a = model.force(s), None
+    with suppress(TypeError, ValueError):  # of what is no array
+        a = jnp.asarray(given)
+    if a is None or a.shape != s.x.shape or jnp.iscomplexobj(a):
+        got = type(given).__name__ if a is None else f"{list(a.shape)}, {a.dtype}"
+        raise SceneError(f"force must return accelerations [m/s²] of shape {list(s.x.shape)}, real numbers, got {got}.")
     return a.astype(s.x.dtype)

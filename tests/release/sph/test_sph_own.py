@@ -12,6 +12,7 @@ import pytest
 import pyvista
 import trimesh
 from checked import refuses
+from jax import lax
 from jax.tree_util import Partial
 from places import ROOT
 from poured import changed, scene_of
@@ -41,8 +42,15 @@ def test_an_own_force_acts_as_it_says_and_its_parameter_is_traced():
     end, _ = sph.advance(model, sph.begin(model, sph.make_state(FREE)), None, 50)
     t, w = 0.5, 2.0
     np.testing.assert_allclose(end.x, FEW * np.cos(w * t) + FREE.velocities * np.sin(w * t) / w, rtol=1e-3)
-    with pytest.raises(SceneError, match=r"force must return accelerations \[m/s²\] of shape \[3, 2\], got \[2\]"):
-        sph.begin(replace(model, force=lambda s: s.x[0]), sph.make_state(FREE))
+
+
+@pytest.mark.parametrize(
+    ("force", "got"),
+    [(lambda s: s.x[0], r"\[2\], float"), (lambda s: None, "NoneType"), (lambda s: lax.complex(s.x, s.x), r"\[3, 2\], complex")],
+)
+def test_an_own_force_that_returns_something_else_is_refused(force, got):
+    message = rf"force must return accelerations \[m/s²\] of shape \[3, 2\], real numbers, got {got}"
+    refuses(SceneError, message, sph.begin, sph.make_model(FREE, force=force), sph.make_state(FREE))
 
 
 @pytest.mark.parametrize("integrator", ["symplectic", "midpoint"])
