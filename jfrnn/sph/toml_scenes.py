@@ -27,7 +27,7 @@ _NEAR = 0.4  # spacings: boxes side by side are filled by as many particles as f
 
 
 class _Table(BaseModel):
-    model_config = ConfigDict(extra="forbid", strict=False)
+    model_config = ConfigDict(extra="forbid", strict=True)
 
 
 class Block(_Table):

@@ -251,7 +251,7 @@ duration = 0.3
 
 
 def test_a_scene_from_a_file(tmp_path):
-    (tmp_path / "bath.toml").write_text(BATH)
+    (tmp_path / "bath.toml").write_text(BATH.replace("lower = [0.0, 0.0]", "lower = [0, 0]"))
     scene = sph.read_scene(tmp_path / "bath.toml")
     dummies = (8 + 2 * 3) * (5 + 3) - 8 * 5  # three layers, none above
     assert (scene.name, scene.n, scene.wall.sum()) == ("bath", 12 + 3 + dummies, dummies)
@@ -344,6 +344,8 @@ def test_a_mistake_in_what_is_written_is_named(tmp_path, more, message):
     ("old", "new", "message"),
     [
         ("spacing = 0.1", "spacing = -0.1", "spacing: input should be greater than 0, got -0.1"),
+        ("spacing = 0.1", "spacing = true", "spacing: input should be a valid number, got True"),
+        ("upper = [0.4, 0.3]", 'upper = [0.4, "0.3"]', r"fill\[0\].upper\[1\]: input should be a valid number, got '0.3'"),
         ("spacing = 0.1", "spacing = ", "is no TOML"),
         ("step = 0.005", "steps = 0.005", "steps: extra inputs are not permitted"),
         ("sound_speed = 10.0", "sound = 10.0", "physics: got an unexpected keyword argument 'sound'"),
