@@ -75,6 +75,11 @@ def _check_parts(scene: FluidScene) -> None:
             f"integrator 'leapfrog' carries no density or pressure, got evolve {physics.evolve!r}: "
             "take evolve 'summation', or integrator 'symplectic' or 'midpoint'."
         )
+    if physics.transport is not None and physics.shifting is not None:
+        raise SceneError(
+            f"transport and shifting both move particles so that they stay evenly spread, got {physics.transport} and "
+            f"{physics.shifting}: take one of them, and None for the other."
+        )
     if scene.tank is not None and physics.restitution is None:
         raise SceneError("restitution must be a number from 0 to 1 in a tank, got None: take 1 for walls that take no speed away.")
     if scene.dim != len("xy") and "source" in (physics.pressure, physics.viscosity_form):

@@ -93,6 +93,11 @@ def test_what_is_no_scene_is_refused():
     refuses(SceneError, "scene must be a FluidScene or a GasScene, got an array", make_model, POSITIONS)
 
 
+def test_transport_and_shifting_are_refused_together():
+    scene = replace(SCENE, physics=replace(PHYSICS, transport=9.0, shifting=0.1))
+    refuses(SceneError, "transport and shifting both move particles .*, got 9.0 and 0.1: take one of them", make_model, scene)
+
+
 def test_a_solid_that_lies_beside_the_first_particles_is_taken(tmp_path):
     """A block that falls on a cube 3 cm under it."""
     positions = fluids.lattice((0.0,) * 3, (4, 4, 4), 0.01)
