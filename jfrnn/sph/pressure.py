@@ -1,7 +1,7 @@
 """Pressure force, in the forms that are in use: each returns the factor of ∇W in what neighbor j adds to the acceleration of i.
 
 ∇W is the gradient at i [1/m^(d+1)], shape [d]; factors have shape []. All forms but `difference` are antisymmetric in mass times
-acceleration: with them momentum is kept to the rounding of the sums, unless pressures are `less_mean`.
+acceleration: with them momentum is kept to the rounding of the sums, unless pressures are `less_mean` or ∇W is corrected.
 """
 
 from jax import Array
