@@ -96,6 +96,7 @@ def _check_parts(scene: FluidScene) -> None:
 def _check_solid(physics: Physics[float, tuple[float, ...]]) -> None:
     """Refuse what walls of triangles have no integrals for."""
     for name, allowed in (
+        ("kernel", ("cubic", "quintic", "wendland2", "wendland4", "wendland6")),  # "poly6" has the gradients of another kernel
         ("evolve", ("continuity",)),
         ("integrator", ("symplectic",)),
         ("pressure", ("mean", "symmetric", "volume")),

@@ -243,6 +243,7 @@ def test_gradients_through_contact():
 @pytest.mark.parametrize(
     ("change", "match"),
     [
+        ({"kernel": "poly6"}, "kernel must be 'cubic' or .* or 'wendland6' beside a solid, got 'poly6'"),
         ({"evolve": "summation"}, "evolve must be 'continuity' beside a solid, got 'summation'"),
         ({"shifting": 0.1}, "shifting must be None beside a solid"),
         ({"pressure": "difference"}, "pressure must be 'mean' or 'symmetric' or 'volume' beside a solid"),
