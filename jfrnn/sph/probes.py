@@ -1,6 +1,7 @@
 """What may be measured as a run goes on: functions of a model and a state, for `run(probes=...)` and for `jax.jit`."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import jax.numpy as jnp
@@ -90,7 +91,8 @@ def surface_height(place: Sequence[float], radius: float) -> Probe:
 def force_on_walls(about: Sequence[float] | None = None) -> Probe:
     """Return a probe of the force [N] on all walls, of dummies and of triangles, and of its torque [N m].
 
-    What the walls do to the fluid is what is left of Σ m a without gravity and an own force. So it is right for forms of pressure
+    What the walls do to the fluid is what is left of Σ m a without gravity and an own force, a being what acts also on particles
+    that keep their velocity because they have just entered. So it is right for forms of pressure
     and viscosity that keep momentum, without damping, and torque as far as forces of pairs are along their distances, which viscous
     ones are not: beside triangles, take `force_on_solid`.
 
@@ -102,12 +104,14 @@ def force_on_walls(about: Sequence[float] | None = None) -> Probe:
     """
 
     def probe(model: Model, s: State) -> dict[str, Array]:
-        a = s.a if model.physics.gravity is None else s.a - model.physics.gravity
+        a = s.a
+        if model.guided is not None:  # particles that keep their velocity have no acceleration, and yet push others: let go of them
+            free = replace(model, guided=None, physics=replace(model.physics, integrator="symplectic"))
+            a = solver.begin(free, s).a
+        a = a if model.physics.gravity is None else a - model.physics.gravity
         own = own_acceleration(model, s)
-        moved = mass_there(model, s)
-        if model.enters is not None and model.guided is not None:
-            moved = jnp.where(s.time < model.enters + model.guided, 0, moved)
-        return _force_and_torque(-moved[:, None] * (a if own is None else a - own), wrapped(model, s.x), about)
+        onto = -mass_there(model, s)[:, None] * (a if own is None else a - own)
+        return _force_and_torque(onto, wrapped(model, s.x), about)
 
     return probe
 

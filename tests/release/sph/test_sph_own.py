@@ -6,6 +6,7 @@ import sys
 from dataclasses import replace
 
 import h5py
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -127,6 +128,20 @@ def test_probes_of_a_lattice():
     np.testing.assert_allclose(force["force"], [2.0, 0.0], atol=1e-12)  # what holds the fluid back is pushed on
     assert force["torque"] == pytest.approx(1.0)
     refuses(SceneError, r"points must have shape \[k, 2\], got \[2\]", sph.pressure_at((0.5, 0.5)), model, s)
+
+
+def test_the_force_on_walls_knows_what_guides_particles_that_enter():
+    """It is that of the same fluid of which no particle is guided."""
+    x = sph.lattice((0.0, 0.0), (6, 6), 0.1)
+    scene = replace(FREE, positions=x, velocities=x[:, ::-1] ** 2, masses=np.full(36, 0.01), wall=x[:, 1] < 0.2)
+    scene = changed(replace(scene, densities=1 + 0.1 * x.sum(axis=1)), viscosity=0.1, gravity=(0.0, -9.81))
+    entering, found = replace(scene, enters=np.where(x[:, 0] < 0.3, 0.0, -9.0), guided=1.0), []
+    for each in (scene, entering):
+        model = sph.make_model(each, backend="brute")
+        s = sph.begin(model, sph.make_state(each))
+        found.append(np.concatenate(jax.tree.map(np.atleast_1d, list(sph.force_on_walls()(model, s).values()))))
+    assert np.abs(found[0]).min() > 0.01
+    np.testing.assert_allclose(found[1], found[0], rtol=1e-9)
 
 
 @pytest.mark.parametrize(
