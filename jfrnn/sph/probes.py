@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -150,6 +151,8 @@ def _check_vector(name: str, value: Sequence[float], count: int) -> np.ndarray:
 
 
 _TAKEN = ("step", "time", "time [s]")
+_NO_HEAD = frozenset(',"\n')
+_REAL = (jnp.floating, jnp.integer, jnp.bool_)
 
 
 def check_names(probes: dict[str, Probe]) -> None:
@@ -159,15 +162,30 @@ def check_names(probes: dict[str, Probe]) -> None:
     for name, probe in probes.items():
         if name in _TAKEN:
             raise SceneError(f"probes must not be called {name!r}, as a column of each table is: take another name.")
-        if not isinstance(name, str) or not name or set(name) & set(',"\n') or not callable(probe):
+        if not isinstance(name, str) or not name or set(name) & _NO_HEAD or not callable(probe):
             raise SceneError(f"probes must be functions by names without a comma, got {name!r}: {probe!r}.")
 
 
-def columns(name: str, value: Any) -> dict[str, float]:  # noqa: ANN401
-    """Return what a probe gave as columns of a table: "name", "name_key" of a dict, "name_0", "name_1" ... of an array."""
-    if isinstance(value, dict):
-        return {key: number for part, inner in value.items() for key, number in columns(f"{name}_{part}", inner).items()}
-    array = np.asarray(value, np.float64)
-    if array.ndim == 0:
-        return {name: float(array)}
-    return {f"{name}_{k}": float(number) for k, number in enumerate(array.reshape(-1))}
+def columns(probes: dict[str, Probe], model: Flow, s: State) -> list[str]:
+    """Return the heads of the columns of probes, in the order of their leaves: "name", "name_key" of a dict, "name_0" of an array.
+
+    Raises:
+        SceneError: A probe returns what is no real number, or two columns have one head, or one that cannot stand in a table.
+    """
+    heads: list[str] = []
+
+    def look(model: Flow, s: State) -> None:
+        seen = {name: probe(model, s) for name, probe in probes.items()}
+        for path, leaf in jax.tree_util.tree_flatten_with_path(seen, is_leaf=lambda leaf: leaf is None)[0]:
+            head, kind = jax.tree_util.keystr(path, simple=True, separator="_"), getattr(leaf, "dtype", type(leaf))
+            if not any(jnp.issubdtype(kind, real) for real in _REAL):
+                got = f"{getattr(kind, '__name__', kind)} for the column {head!r}"
+                raise SceneError(f"probes must return real numbers, arrays or dicts of them, got {got}.")
+            heads.extend([f"{head}_{k}" for k in range(leaf.size)] if getattr(leaf, "shape", ()) else [head])
+
+    jax.eval_shape(look, model, s)
+    if ill := [head for head in heads if set(head) & _NO_HEAD]:
+        raise SceneError(f"probes must return dicts whose keys have no comma, got the column {ill[0]!r}.")
+    if len(set(heads)) < len(heads):
+        raise SceneError(f"probes give two columns {max(heads, key=heads.count)!r}: take another name for a probe or a key.")
+    return heads

@@ -104,12 +104,12 @@ def run(
             model, first = make_model(scene, dtype, force=force), make_state(scene, dtype)  # what is refused leaves no folder
         except SceneError as error:
             raise SceneError(f"scene {scene.name!r}: {error}") from error
+        write = _Writer(scene, model, first, folder, how, probes or {})
         held.enter_context(snapshots.hold(folder))
         snapshots.check_same(_describe(scene, how, dtype), folder)
         saved = snapshots.latest(folder / "snapshots", scene)
         s, step = saved or (first, 0)
         nbrs = _first_neighbors(scene, model, s, how)
-        write = _Writer(scene, model, folder, how, probes or {})
         if saved is None:
             s = jax.jit(solver.begin)(model, s, nbrs)
             write.line(s, step)
@@ -204,8 +204,9 @@ def _chunk_of_particles(model: Flow, s: State, nbrs: Neighbors, goal: float, mos
 class _Writer:
     """Writes what belongs to a moment of a run."""
 
-    def __init__(self, scene: Scene, model: Flow, folder: Path, how: How, probes: dict[str, Probe]) -> None:
+    def __init__(self, scene: Scene, model: Flow, first: State, folder: Path, how: How, probes: dict[str, Probe]) -> None:
         self._scene, self._model, self._folder, self._how = scene, model, folder, how
+        self._heads = columns(probes, model, first)
         self._probe = jax.jit(lambda model, s: {name: probe(model, s) for name, probe in probes.items()}) if probes else None
         self._line: dict[str, float] = {}
 
@@ -226,8 +227,9 @@ class _Writer:
         tables = {"energies.csv": {snapshots.head(name, s.x.shape[1]): value for name, value in self._line.items()}}
         if self._probe is None:
             return tables
-        seen = {key: number for name, value in self._probe(self._model, s).items() for key, number in columns(name, value).items()}
-        return tables | {"probes.csv": {snapshots.head("time", s.x.shape[1]): self._line["time"]} | seen}
+        seen = [float(number) for leaf in jax.tree.leaves(self._probe(self._model, s)) for number in np.ravel(np.asarray(leaf))]
+        time = {snapshots.head("time", s.x.shape[1]): self._line["time"]}
+        return tables | {"probes.csv": time | dict(zip(self._heads, seen, strict=True))}
 
     def snapshot(self, s: State, nbrs: Neighbors, step: int) -> None:
         """Write the state of the last line, and draw it."""

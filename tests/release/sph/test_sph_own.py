@@ -165,9 +165,16 @@ def test_a_mistake_in_a_probe_is_named(probe, message):
         ({"a, b": spring}, "probes must be functions by names without a comma, got 'a, b'"),
         ({"a": 1.0}, "probes must be functions by names without a comma, got 'a': 1.0"),
         ({"time": spring}, "probes must not be called 'time'"),
+        (
+            {"p": lambda model, s: s.time, "a_0": lambda model, s: 1.0, "a": lambda model, s: s.x},
+            "probes give two columns 'a_0': take",
+        ),
+        ({"a": lambda model, s: {"b, c": s.time}}, "probes must return dicts whose keys have no comma, got the column 'a_b, c'"),
+        ({"a": lambda model, s: {"b": lax.complex(s.x, s.x)}}, "probes must return real numbers, .* got complex.* column 'a_b'"),
+        ({"a": lambda model, s: None}, "probes must return real numbers, arrays or dicts of them, got NoneType for the column 'a'"),
     ],
 )
-def test_a_mistake_in_names_of_probes_is_named(tmp_path, probes, message):
+def test_a_mistake_in_probes_is_named(tmp_path, probes, message):
     refuses(SceneError, message, sph.run, FREE, tmp_path / "out", sph.How(pictures=False), probes=probes)
     assert not (tmp_path / "out").exists()
 
