@@ -46,7 +46,8 @@ class Physics(Generic[Number, Vector]):
         slip: Walls of dummy particles do not hold the fluid along them.
         tears: The fluid gives way where it is stretched: a density that is carried along does not fall below that at rest. Without
             it, a jet that breaks up pulls its particles together in pairs and clumps.
-        integrator: "leapfrog" (kick, drift), "symplectic" (kick, drift, kick), or "midpoint" (Runge-Kutta of second order).
+        integrator: "leapfrog" (kick, drift), "symplectic" (kick, drift, kick), or "midpoint" (Runge-Kutta of second order). In the
+            first two, viscosity and damping are of first order in time, and in "leapfrog" an own force that goes by velocities.
         cfl: Courant number of a scene without a step: its steps are cfl h/(c + |v|) or, by viscosity and accelerations, shorter.
     """
 

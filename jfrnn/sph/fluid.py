@@ -210,7 +210,7 @@ def _evaluate(model: Model, s: State, nbrs: Neighbors, dt: Array | None = None) 
     if dt is not None:
         s = s._replace(**_carry(model, s, s, rho, inverse, nbrs, dt))
         rho = s.rho if s.rho is not None else rho
-    a, w = forces.accelerations(model, s, forces.fields(model, s, rho, inverse, nbrs), nbrs)
+    a, w = forces.accelerations(model, s, forces.fields(model, s, rho, inverse, nbrs), nbrs, dt)
     return s._replace(a=a, w=_besides(model, w, s.last if dt is None else dt))
 
 
@@ -255,8 +255,9 @@ def _leapfrog(model: Model, s: State, dt: Array, nbrs: Neighbors) -> tuple[State
 def _symplectic(model: Model, s: State, dt: Array, nbrs: Neighbors) -> tuple[State, Neighbors]:
     """Kick half, drift, carry density or pressure on at the new positions, kick half (velocity Verlet).
 
-    The rate of what is carried is that of the new positions and the velocities of the middle: of first order. Without dissipation,
-    energy drifts with dt; with `_midpoint`, with dt³ on the elliptical drop.
+    The rate of what is carried is that of the new positions and the velocities of the middle, and so are viscosity and damping: of
+    first order. Without dissipation, energy drifts with dt; with `_midpoint`, with dt³ on the elliptical drop. An own force is of
+    second order, also in velocities, which it is given at the time of the positions.
     """
     s = s._replace(v=s.v + dt / 2 * s.a)
     moved = s.x + dt * _transport_velocity(model, s)

@@ -177,8 +177,11 @@ def fields(model: Model, s: State, rho: Array, inverse: Array | None, nbrs: Neig
     return Fields(walls.keep_fluid(model.wall, rho, wall_rho), walls.keep_fluid(model.wall, p, wall_p), u, inverse)
 
 
-def accelerations(model: Model, s: State, seen: Fields, nbrs: Neighbors) -> tuple[Array, Array | None]:
-    """Return accelerations [m/s²], shape [n, d], and velocities by which particles move besides v [m/s], or None."""
+def accelerations(model: Model, s: State, seen: Fields, nbrs: Neighbors, dt: Array | None = None) -> tuple[Array, Array | None]:
+    """Return accelerations [m/s²], shape [n, d], and velocities by which particles move besides v [m/s], or None.
+
+    Where velocities stand dt/2 behind positions [s], an own force is given those of the time of the positions.
+    """
     physics = model.physics
     values = {"rho": seen.rho, "p": seen.p, "v": s.v, "u": seen.u}
     values |= {key: value for key, value in (("w", s.w), ("inverse", seen.inverse)) if value is not None}
@@ -212,7 +215,7 @@ def accelerations(model: Model, s: State, seen: Fields, nbrs: Neighbors) -> tupl
 
     sums = _sum(term, model, s, values, nbrs, "fluid")
     a = sums["a"] if physics.gravity is None else sums["a"] + physics.gravity
-    own = own_acceleration(model, s)
+    own = own_acceleration(model, s, dt)
     if own is not None:
         a = a + own
     if s.solid is not None:

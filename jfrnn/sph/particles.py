@@ -213,11 +213,14 @@ def mass_there(model: Flow, s: State) -> Array:
     return model.fluid_mass if there is None else jnp.where(there, model.fluid_mass, 0)
 
 
-def own_acceleration(model: Flow, s: State) -> Array | None:
-    """Return what the own force of a model says [m/s²], shape [n, d]; None where it has none, a `SceneError` if it says none."""
+def own_acceleration(model: Flow, s: State, dt: Array | None = None) -> Array | None:
+    """Return what the own force of a model says [m/s²], shape [n, d]; None where it has none, a `SceneError` if it says none.
+
+    It is given velocities at the time of positions: those of a state that stand dt/2 behind [s] are brought there by `s.a`.
+    """
     if model.force is None:
         return None
-    given, a = model.force(s), None
+    given, a = model.force(s if dt is None else s._replace(v=s.v + dt / 2 * s.a)), None
     with suppress(TypeError, ValueError):  # of what is no array
         a = jnp.asarray(given)
     if a is None or a.shape != s.x.shape or jnp.iscomplexobj(a):

@@ -55,14 +55,14 @@ def test_an_own_force_that_returns_something_else_is_refused(force, got):
 
 
 @pytest.mark.parametrize("integrator", ["symplectic", "midpoint"])
-def test_forces_know_the_time_of_the_positions_they_are_given(integrator):
-    """A force of time alone, cos 3t, is integrated to second order: half the step, a quarter of the error."""
+def test_forces_know_the_time_and_velocities_of_the_positions_they_are_given(integrator):
+    """A force of time and velocities, cos 3t - v, is integrated to second order: half the step, a quarter of the error."""
     off = []
     for step in (0.1, 0.05):
         scene = replace(changed(FREE, integrator=integrator), duration=1.0, step=step)
-        model = sph.make_model(scene, backend="brute", force=lambda s: jnp.cos(3 * s.time) + 0 * s.x)
+        model = sph.make_model(scene, backend="brute", force=lambda s: jnp.cos(3 * s.time) - s.v)
         end, _ = sph.advance(model, sph.begin(model, sph.make_state(scene)), None, round(1 / step))
-        off.append(abs(float(end.v[1, 0]) - np.sin(3.0) / 3))
+        off.append(abs(float(end.v[1, 0]) - (np.cos(3.0) + 3 * np.sin(3.0) - np.exp(-1.0)) / 10))
     assert 0 < off[1] < 0.3 * off[0] < 0.003
 
 
