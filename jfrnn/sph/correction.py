@@ -6,9 +6,9 @@ from jax import Array
 from jfrnn.sph.pairs import Pair, Values
 
 
-def moment(pair: Pair, j: Values) -> Array:
+def moment(pair: Pair, j: Values, gradient: Array) -> Array:
     """Return V_j ∇W ⊗ (x_j - x_i), shape [d, d], whose sum is the identity where particles lie evenly on all sides."""
-    return -j["volume"] * pair.pull * pair.r[:, None] * pair.r[None, :]
+    return j["volume"] * gradient[:, None] * pair.r[None, :]
 
 
 def inverse(moments: Array, least: float = 0.1) -> Array:

@@ -122,7 +122,11 @@ def corrections(model: Model, s: State, rho: Array, nbrs: Neighbors) -> Array | 
     """Return what kernel gradients are multiplied with, shape [n, d, d], or None."""
     if not model.physics.corrected:
         return None
-    return correction.inverse(_sum(lambda pair, i, j: correction.moment(pair, j), model, s, {"rho": rho}, nbrs, "fluid"))
+
+    def term(pair: Pair, i: Values, j: Values) -> Array:
+        return correction.moment(pair, j, _gradient(model, pair, i))
+
+    return correction.inverse(_sum(term, model, s, {"rho": rho}, nbrs, "fluid"))
 
 
 def carried_rate(model: Model, s: State, rho: Array, inverse: Array | None, nbrs: Neighbors) -> Array:
