@@ -25,7 +25,7 @@ from jfrnn._geometry import (
     Cutoff,
     Status,
     bound_wrapping,
-    is_valid,
+    find_bounding,
     make_cutoff,
     make_lattice,
     sides_of,
@@ -138,10 +138,11 @@ def numbers_of_box(inputs: Inputs, options: Options) -> Array:
     if box is None or images is None:
         raise TypeError("this search has no box.")
     lattice, radius = make_lattice(box, images, dtype), jnp.asarray(_one_cutoff(inputs).radius, dtype)
+    known = find_bounding(lattice, radius)
 
     def row(most: Array) -> Array:
-        bounds = bound_wrapping(most, lattice, radius)
-        whole = (bounds.enough & is_valid(lattice)).astype(dtype)
+        bounds = bound_wrapping(most, lattice, known)
+        whole = bounds.enough.astype(dtype)
         return jnp.concatenate([radius[None], lattice_numbers(lattice, bounds.reach, bounds.slack, most), whole[None]])
 
     return jax.vmap(row)(jnp.asarray(renew.MOST_TURNS, dtype))

@@ -145,7 +145,7 @@ def count_few(inputs: Inputs, options: Options) -> np.ndarray | None:
 
     It counts in plain searches of few concrete particles by an engine whose kernels run here, once the kernel is compiled.
     """
-    sources, queries, active, box, cutoff, batch, exclude = inputs
+    sources, queries, active, box, cutoff, batch, exclude, *_ = inputs
     n = sources.shape[0]
     plain = queries is None and active is None and batch is None and exclude is None
     if (

@@ -68,7 +68,6 @@ from jfrnn._geometry.lattice import (
     forward_shifts,
     fractions_of,
     given_shifts,
-    is_valid,
     make_lattice,
     nearest_shifts,
     shift_pairs,
@@ -93,4 +92,15 @@ from jfrnn._geometry.status import (
     shape_of,
     tell,
 )
-from jfrnn._geometry.wrapping import NOT_FINITE, TOO_FAR, NearRows, Wrapped, bound_wrapping, unpack_turns, wrap
+from jfrnn._geometry.wrapping import (
+    NOT_FINITE,
+    TOO_FAR,
+    KnownBox,
+    NearRows,
+    Wrapped,
+    bound_wrapping,
+    find_bounding,
+    known_box,
+    unpack_turns,
+    wrap,
+)

@@ -8,13 +8,16 @@ given floats.
 import functools
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
 from jfrnn._geometry.batch import Batch
-from jfrnn._geometry.images import LARGEST_TURN
-from jfrnn._geometry.lattice import Lattice, add_rows, fractions_of, largest_component, product, translation
+from jfrnn._geometry.box import Box, round_box
+from jfrnn._geometry.images import LARGEST_TURN, Images
+from jfrnn._geometry.lattice import Lattice, add_rows, fractions_of, is_valid, largest_component, make_lattice, product, translation
+from jfrnn._tracing import Internal, at_once, compile_program, own_transfers, without_mesh
 
 _TURN_BITS = 10
 NOT_FINITE, TOO_FAR, _MOST_TURNS = 1 << _TURN_BITS, 2 << _TURN_BITS, (1 << _TURN_BITS) - 1
@@ -31,7 +34,7 @@ class Wrapped(NamedTuple):
         slack: [] bound on the error of each component of a displacement of wrapped coordinates, for any shift within reach.
         reach: [d] the largest distance of a pair along each axis, in fractional coordinates (lengths along open axes).
         margin: [d] the part of `reach` that does not depend on the cutoff.
-        enough: [] bool, whether no pair needs other images than those considered.
+        enough: [] bool, whether no pair needs other images than those considered, in a lattice that is one.
         met: [] int32, the bits `NOT_FINITE` and `TOO_FAR` if there are such particles; the lower bits are the most turns.
         rows: Rows of sources and of queries, if a kernel has brought them near.
     """
@@ -122,15 +125,17 @@ def wrap(
     radius: np.floating | Array,
     batch: Batch | None = None,
     brought: list[NearRows] | None = None,
+    known: "Bounding | None" = None,
 ) -> Wrapped:
-    """Translate particles into one cell of the lattice and bound the rounding errors; `brought`: what kernels know of them.
+    """Translate particles into one cell of the lattice and bound the rounding errors.
+
+    `brought` is what kernels know of the particles, `known` what lattice and radius tell of the errors, if that was found before.
 
     Let u be the computed fractional coordinates, R = matrix @ transform - 1 the residual of the transform (periodic columns). Then
     |u_j + S - u_i - (x_j - x_i + S·A) @ transform| is at most the rounding errors of u_i and u_j plus sum |S|·|R|, and |d @
     transform| <= |d|·|column of the transform|. `reach` is the sum of these terms, each rounded up generously.
     """
-    dtype, images, dim = np.dtype(sources.dtype), lattice.images, lattice.dim
-    periodic = lattice.spread(lattice.periodic, lattice.origin.ndim)
+    dtype, dim = np.dtype(sources.dtype), lattice.dim
     clouds = [sources] if queries is None else [sources, queries]
     lattices = [lattice] * len(clouds) if batch is None else [lattice.of_rows(x) for x in (batch.sources, batch.of_queries)]
     if brought is None:
@@ -146,12 +151,34 @@ def wrap(
     met = _joined(found)
     most = _most_turns(met, dtype)
 
-    largest = None
-    if not (images.orthogonal or (lattice.flags is None and np.all(periodic))):
+    if not (lattice.images.orthogonal or (lattice.flags is None and all(lattice.images.periodic))):
         largest = functools.reduce(jnp.maximum, _largest_finite(wrapped, batch, len(lattice.matrix)))
-    bounds = bound_wrapping(most, lattice, radius, batch is not None, largest)
+        known = find_bounding(lattice, radius, batch is not None, largest)
+    bounds = bound_wrapping(most, lattice, known or find_bounding(lattice, radius, batch is not None))
     rows = None if brought is None else (brought[0].rows, brought[-1].rows)
     return Wrapped(wrapped[0], wrapped[-1], packed[0], packed[-1], *bounds, met, rows)
+
+
+class Bounding(NamedTuple):
+    """What bounds the rounding errors of wrapping, but for how many turns there are: all that a lattice and a radius tell.
+
+    Attributes:
+        valid: [] bool, whether the lattice is finite, its vectors independent and its lengths positive.
+        length: [d] the radius in fractional coordinates (lengths along open axes).
+        rounding: [d] the error of fractional coordinates without a turn, in units of which `more` come for each turn.
+        more: [d] likewise.
+        cell: [d] the largest coordinate of the cell, 0 along components to which no lattice vector contributes.
+        wrapping: [d] the error of a component from a turn, in units of eps/2.
+        moving: [d] the error of a component from moving to an image, likewise.
+    """
+
+    valid: Array
+    length: Array
+    rounding: Array
+    more: Array
+    cell: Array
+    wrapping: Array
+    moving: Array
 
 
 class Bounds(NamedTuple):
@@ -163,51 +190,83 @@ class Bounds(NamedTuple):
     enough: Array
 
 
-def bound_wrapping(
-    most: Array, lattice: Lattice, radius: np.floating | Array, per_system: bool = False, largest: Array | None = None
-) -> Bounds:
-    """Bound the rounding errors of wrapping by at most `most` turns; `largest` coordinates, where lattices do not tell them."""
-    dtype, images = np.dtype(lattice.matrix.dtype), lattice.images
-    eps, periodic = jnp.finfo(dtype).eps, lattice.spread(lattice.periodic, lattice.origin.ndim)
-    matrix, transform = jnp.abs(lattice.matrix), jnp.abs(lattice.transform)
-    spans = add_rows(matrix)
-    size = jnp.abs(lattice.origin) + (most + 1) * spans  # largest coordinate so many lattice vectors away
-    size = size if largest is None else size + largest
-    residual = lattice.residual + 8 * eps * product(matrix, transform)
-    length = jnp.sqrt(add_rows((transform * radius) ** 2)) * (1 + 16 * eps)
-    most_shifts = jnp.asarray(max(images.reach), dtype)
-    if per_system:  # those of each system alone
-        most_shifts = jnp.minimum(most_shifts, jnp.ceil(largest_component(length)[..., None]) + 1)
-    shifts = most + most_shifts + 1
-    rounding = 8 * eps * product(size[..., None, :], transform)[..., 0, :] + 2 * shifts * add_rows(residual)
-    if images.orthogonal:
-        rounding = jnp.where(periodic, rounding, 0)  # cells along open axes use the given coordinates
-    margin = 2 * rounding + jnp.where(periodic, 8 * eps, 0)
-    reach = length + margin
-    most_images = lattice.spread(jnp.asarray(images.reach, dtype), periodic.ndim)
-    limit = jnp.where(periodic, 0.5 if images.nearest else most_images, jnp.inf)
-    enough = (reach < limit).all(axis=-1) if images.nearest else (reach <= limit).all(axis=-1)
-    slack = _wrapping_error(most, most_shifts, lattice)
-    return Bounds(slack, reach, margin, enough)
-
-
-def _wrapping_error(most: Array, reach: Array, lattice: Lattice) -> Array:
-    """Bound the error of a component of x_j - x_i from wrapping both by at most `most` turns and moving one to an image.
-
-    Images lie up to `reach` cells away, [] or [systems, 1].
+def find_bounding(
+    lattice: Lattice, radius: np.floating | Array, per_system: bool = False, largest: Array | None = None
+) -> Bounding:
+    """Return what bounds the rounding errors of wrapping; `largest` coordinates, where lattices do not tell them.
 
     With u = eps/2: a product t·A with a whole number t has an error of u|t·A|, or none for t = 0, 1, 2; with d such products, d
     times that. Adding a coordinate of the cell costs another u of it. Points that are not wrapped have no error.
     """
-    dim, images = lattice.dim, lattice.images
-    u = 0.525 * jnp.finfo(lattice.matrix.dtype).eps  # 5 % more than eps/2 covers second-order terms and the rounding of this sum
-    spans = add_rows(jnp.abs(lattice.matrix))  # 0 for components to which no lattice vector contributes
-    cell = jnp.where(spans > 0, jnp.abs(lattice.origin) + spans, 0)
+    dtype, images, dim = np.dtype(lattice.matrix.dtype), lattice.images, lattice.dim
+    eps, periodic = jnp.finfo(dtype).eps, lattice.spread(lattice.periodic, lattice.origin.ndim)
+    matrix, transform = jnp.abs(lattice.matrix), jnp.abs(lattice.transform)
+    spans = add_rows(matrix)  # 0 for components to which no lattice vector contributes
+    size = jnp.abs(lattice.origin) + spans  # of coordinates of the cell
+    known = size if largest is None else size + largest
+    residual = lattice.residual + 8 * eps * product(matrix, transform)
+    length = jnp.sqrt(add_rows((transform * radius) ** 2)) * (1 + 16 * eps)
+    reach = jnp.asarray(max(images.reach), dtype)
+    if per_system:  # those of each system alone
+        reach = jnp.minimum(reach, jnp.ceil(largest_component(length)[..., None]) + 1)
+    doubled = 2 * add_rows(residual)
+    more = 8 * eps * product(spans[..., None, :], transform)[..., 0, :] + doubled
+    rounding = 8 * eps * product(known[..., None, :], transform)[..., 0, :] + (reach + 1) * doubled
+    if images.orthogonal:
+        rounding, more = (jnp.where(periodic, x, 0) for x in (rounding, more))  # cells along open axes use the given coordinates
+    cell = jnp.where(spans > 0, size, 0)
     products = 1 if images.orthogonal else 2 * dim
-    wrapping = jnp.where(most > 0, products * most * spans + cell, 0)
-    exact = images.orthogonal & (reach <= 2)
-    moving = jnp.where(exact, 0, products * reach) * spans + cell + reach * spans
-    return u * largest_component(2 * wrapping + moving)
+    moving = jnp.where(images.orthogonal & (reach <= 2), 0, products * reach) * spans + cell + reach * spans
+    return Bounding(is_valid(lattice), length, rounding, more, cell, products * spans, moving)
+
+
+def bound_wrapping(most: Array, lattice: Lattice, known: Bounding) -> Bounds:
+    """Bound the rounding errors of wrapping by at most `most` turns."""
+    eps, images = jnp.finfo(lattice.matrix.dtype).eps, lattice.images
+    periodic = lattice.spread(lattice.periodic, lattice.origin.ndim)
+    margin = 2 * (known.rounding + most * known.more) + jnp.where(periodic, 8 * eps, 0)
+    reach = known.length + margin
+    most_images = lattice.spread(jnp.asarray(images.reach, lattice.matrix.dtype), periodic.ndim)
+    limit = jnp.where(periodic, 0.5 if images.nearest else most_images, jnp.inf)
+    enough = (reach < limit).all(axis=-1) if images.nearest else (reach <= limit).all(axis=-1)
+    wrapping = jnp.where(most > 0, most * known.wrapping + known.cell, 0)
+    # 5 % more than eps/2 covers second-order terms and the rounding of this sum
+    slack = 0.525 * eps * largest_component(2 * wrapping + known.moving)
+    return Bounds(slack, reach, margin, enough & known.valid)
+
+
+class KnownBox(NamedTuple):
+    """What is found of a box before a program runs; None: the program finds it.
+
+    XLA takes longer to compile this than all that a search in a box is besides, and would for each shape.
+    """
+
+    lattice: Lattice | None = None
+    bounding: Bounding | None = None
+
+
+def known_box(box: Box, images: Images, dtype: np.dtype, radius: np.floating | Array | None) -> tuple[Box, KnownBox]:
+    """Return a box, rounded to a dtype, and what is known of it where the host has its numbers; it is kept for further calls."""
+    arrays, structure = jax.tree.flatten(box)
+    if box.per_system or not all(isinstance(x, np.ndarray) for x in arrays):
+        return round_box(box, dtype), KnownBox()
+    known = tuple((np.asarray(x, dtype).tobytes(), x.shape) for x in arrays)
+    with own_transfers(), without_mesh(), at_once():
+        return _known_box(structure, known, images, np.dtype(dtype), radius if isinstance(radius, np.floating) else None)
+
+
+@functools.lru_cache(maxsize=64)
+def _known_box(
+    structure: Internal, known: tuple, images: Images, dtype: np.dtype, radius: np.floating | None
+) -> tuple[Box, KnownBox]:
+    box = jax.tree.unflatten(structure, [np.frombuffer(data, dtype).reshape(shape) for data, shape in known])
+    return _find(box, images, radius)
+
+
+@functools.partial(compile_program, static_argnames="images")
+def _find(box: Box, images: Images, radius: np.floating | None) -> tuple[Box, KnownBox]:
+    lattice = make_lattice(box, images, np.dtype(box.vectors.dtype))
+    return box, KnownBox(lattice, None if radius is None else find_bounding(lattice, radius))
 
 
 def _largest_finite(clouds: list[Array], batch: Batch | None, systems: int) -> list[Array]:

@@ -205,8 +205,11 @@ def check_problem(asked: Asked) -> tuple["Problem", engine.Inputs]:
     options = engine.Options(keep, chosen, closed, 0.0 if radii is None else skin, images, static_reach, ordered)
     shape = {"own_queries": queries is not None, "masked": active is not None, "source_count": sources.shape[0]}
     problem = Problem(options, radius, skin, **shape, dim=sources.shape[1], dtype=dtype)
-    box = None if box is None or images is None else geometry.box_of_list(geometry.round_box(box, dtype), images, reach)
-    return problem, engine.Inputs(sources, queries, active, box, problem.listed_within(radii), systems, excluded)
+    cutoff, known = problem.listed_within(radii), geometry.KnownBox()
+    if box is not None and images is not None:
+        box, known = geometry.known_box(box, images, dtype, cutoff.radius if isinstance(cutoff, geometry.Cutoff) else None)
+        box = geometry.box_of_list(box, images, reach)
+    return problem, engine.Inputs(sources, queries, active, box, cutoff, systems, excluded, known)
 
 
 # --- its search -----------------------------------------------------------------------------------------------------------

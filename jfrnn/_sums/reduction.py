@@ -50,7 +50,7 @@ def pairs_of_search(problem: Problem, inputs: Inputs, summed: bool) -> Pairs:
         ValueError: outside jit, the data show that pairs may be missing.
     """
     options = problem.options
-    sources, queries, active, box, cutoff, batch, exclude = inputs
+    sources, queries, active, box, cutoff, batch, exclude, *_ = inputs
     fixed = lax.stop_gradient(inputs._replace(sources=hide_inactive(sources, active), active=None))
     relation, several = Searched(fixed, options), isinstance(cutoff, geometry.Radii)
     largest = geometry.make_cutoffs(cutoff, options.closed).largest if isinstance(cutoff, geometry.Radii) else cutoff.radius
