@@ -164,9 +164,10 @@ def by_data(a):
     each = jax.vmap(lambda row, k: row[k])
     read = a[k, l], a[both], a.at[:, k].get(mode="fill"), a.at[k, l].get(mode="clip"), jnp.take(a, both, axis=1), each(a, both)
     windows = lax.dynamic_slice(a, (k, l), (1, 2)), lax.dynamic_update_slice(a, a[:1, :2], (k, l)), lax.dynamic_index_in_dim(a, k)
+    numbers = jnp.take(a[0], k), a[1].at[k].get(mode="fill"), a.at[k, l].get(mode="fill", fill_value=7)
     written = a.at[k, 1].set(7), a.at[:, both].add(a[:, :2]), a.at[k].add(1, mode="clip"), jnp.zeros(3, a.dtype).at[k].set(a[0, 0])
     slopes = jax.grad(lambda a: a[k, l] + (each(a, both) ** 2).sum() + a.at[l].get(mode="fill", fill_value=0).sum())(a)
-    return read, windows, written, slopes
+    return read, windows, numbers, written, slopes
 
 
 SHAPES = {

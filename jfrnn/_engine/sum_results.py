@@ -1,5 +1,6 @@
 """The arrays into which kernels write sums, and the sums in them."""
 
+import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -80,7 +81,9 @@ class SumsOf(NamedTuple):
     def unpack(self, sums: Array, parts: Array, rest: Array, more: Array | None = None) -> FoundSums:
         """Return the results of `pair_sums`; partial sums over all pairs are added together with their rounding errors."""
         width, totals = self._width, self._totals
-        which = as_integer(rest).reshape(self.rows, width, 2) if self.kind.extremes else jnp.zeros((self.rows, width, 0), jnp.int32)
+        shape = (self.rows, width, 2 if self.kind.extremes else 0)
+        which = as_integer(rest[: math.prod(shape)]).reshape(shape)
+        sums = sums if width > 0 else sums[:, :0]
         found = (sums,) if more is None or not self.term.first else (sums, more)
         parts, zero = parts[: 2 * self.slots * totals].reshape(self.slots, 2, totals), jnp.zeros((), parts.dtype)
         added = rounded_sum(*lax.reduce((parts[:, 0], parts[:, 1]), (zero, zero), compensated_sum, (0,)))  # in twice the precision

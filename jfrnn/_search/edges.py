@@ -26,7 +26,8 @@ class Edges(NamedTuple):
         displacement: x_j - x_i [length], in a box plus the lattice translation of the image, shape [total, d]; 0 where `mask` is
             not set, and NaN everywhere if pairs may be missing: there are more of them than `total`, or the list lacks some.
         shift: Lattice shifts S, shape [total, d], int32; 0 where `mask` is not set, the smallest int32 where pairs may be missing.
-        mask: Whether an edge is a pair, shape [total], bool: the first `pair_count` edges are, all others are padding.
+        mask: Whether an edge is a pair, shape [total], bool: the first `pair_count` edges are, all others are padding. Those of a
+            flat list with a skin stay where they stand in the list, with pairs of the skin among them.
         status: Bits of `Status` of the list, with `Status.TOTAL_OVERFLOW` if pairs are missing, shape [], int32.
         distance: Length of the displacement, shape [total]; 0 where `mask` is not set, and NaN where the displacement is.
         pair_count: The true number of pairs, shape [], int32; it may exceed `total`.

@@ -305,8 +305,8 @@ def _update(
     nbrs: Kept, sources: Array, queries: Array | None, active: Array | None, box: geometry.Box | None, radii: geometry.Radii | None
 ) -> Kept:
     """Make a list anew if it is stale; without a box, in its own."""
-    stays, box = box is None, nbrs.box if box is None else box
-    sources, queries, box, radii = lax.stop_gradient((sources, queries, box, radii))
+    nbrs, sources, queries, given, radii = lax.stop_gradient((nbrs, sources, queries, box, radii))
+    stays, box = given is None, nbrs.box if given is None else given
     inputs = Inputs(sources, queries, active, box, nbrs.problem.listed_within(radii), nbrs.batch, nbrs.exclude)
     if nbrs.verlet is None:
         return _make_again(nbrs, inputs)

@@ -35,24 +35,27 @@ def triplets_of(receivers: Array, mask: Array, known: Array, total: int | None, 
     """Return the triplets of edges that ascend by receiver, as many as there are if total is None; `known`: no edge is missing."""
     if not isinstance(half, bool):
         raise TypeError(f"half must be True or False, got {half!r}.")
-    offsets = _count(receivers, mask, half)
+    offsets, pairs = _count(receivers, mask, half)
     if total is None:
         if isinstance(offsets, Tracer):
             raise TypeError("total must be given inside jax.jit: the length of the arrays, which it cannot read from the edges.")
         total = int(jax.device_get(offsets[-1]))
     room = check_total(total)
     check_held(offsets[-1], room, "triplets")
-    found = _find(receivers, offsets, room, half)
+    found = _find(receivers, offsets, pairs, room, half)
     return found._replace(triplet_count=jnp.where(known, found.triplet_count, np.iinfo(np.int32).min))
 
 
 @functools.partial(compile_program, static_argnames=("half",))
-def _count(receivers: Array, mask: Array, half: bool) -> Array:
-    """Return where the triplets of each first edge begin, and those of the last one end, [edges + 1] int32, saturating."""
+def _count(receivers: Array, mask: Array, half: bool) -> tuple[Array, Array]:
+    """Return where the triplets of each first edge begin, and those of the last one end, and how many pairs come before each edge.
+
+    Both are [edges + 1] int32, the first one saturating. Edges that are no pairs may stand anywhere.
+    """
     begin, end = _group(receivers)
-    edge = lax.iota(jnp.int32, len(receivers))
-    others = end - edge - 1 if half else end - begin - 1
-    return add_up(jnp.where(mask, others, 0))
+    pairs = add_up(mask.astype(jnp.int32))
+    others = pairs[end] - (pairs[:-1] if half else pairs[begin]) - 1
+    return add_up(jnp.where(mask, others, 0)), pairs
 
 
 def _group(receivers: Array) -> tuple[Array, Array]:
@@ -64,7 +67,7 @@ def _group(receivers: Array) -> tuple[Array, Array]:
 
 
 @functools.partial(compile_program, static_argnames=("total", "half"))
-def _find(receivers: Array, offsets: Array, total: int, half: bool) -> Triplets:
+def _find(receivers: Array, offsets: Array, pairs: Array, total: int, half: bool) -> Triplets:
     edges, place = len(receivers), lax.iota(jnp.int32, total)
     if 0 in (edges, total):
         none = jnp.full(total, edges, jnp.int32)
@@ -72,9 +75,11 @@ def _find(receivers: Array, offsets: Array, total: int, half: bool) -> Triplets:
     begun = jnp.zeros(total, jnp.int32).at[offsets[1:-1]].add(1, mode="drop", indices_are_sorted=True)
     first = jnp.cumsum(begun, dtype=jnp.int32)
     rank = place - offsets[first]
-    second = first + 1 + rank
+    other = pairs[first] + 1 + rank  # which pair it is
     if not half:
-        begin = _group(receivers)[0][first] + rank
-        second = jnp.where(begin < first, begin, begin + 1)
+        other = pairs[_group(receivers)[0][first]] + rank
+        other = jnp.where(other < pairs[first], other, other + 1)
+    edge_of_pair = jnp.where(pairs[1:] > pairs[:-1], pairs[:-1], edges)
+    second = jnp.zeros(edges, jnp.int32).at[edge_of_pair].set(lax.iota(jnp.int32, edges), mode="drop")[other]
     there = place < offsets[-1]
     return Triplets(jnp.where(there, first, edges), jnp.where(there, second, edges), there, offsets[-1])

@@ -35,7 +35,7 @@ def _values(found: list[_Best], _: Groups, *, term: Term, largest: bool, n: int)
     """Return the extremes that were found, which are differentiable in the operands: only then are they evaluated once more."""
     del n
     values = [value if largest else -value for value, *_ in found]
-    return [value.reshape(-1, *like.shape) for value, like in zip(values, term.summands, strict=True)]
+    return [value.reshape(len(value), *like.shape) for value, like in zip(values, term.summands, strict=True)]
 
 
 def _like(found: list[_Best], _: Groups, *, term: Term, largest: bool, n: int) -> list[jax.ShapeDtypeStruct]:

@@ -284,6 +284,6 @@ def _unpack(term: Term, sums: tuple[Array, ...], totals: Array) -> list[Array]:
         else:
             if row == rows.shape[1] and size > 0:
                 rows, row = next(arrays), 0
-            found.append(rows[:, row : row + size].reshape(-1, *like.shape))
+            found.append(rows[:, row : row + size].reshape(len(rows), *like.shape))
             row += size
     return found

@@ -76,7 +76,7 @@ def gather(eqn: Equation, inputs: list[Values]) -> list[Values]:
             window = eqn.each("select", inside, window, eqn.full(eqn.params["fill_value"]))
         windows.append(np.squeeze(window, gone))
     shape = [size for axis, size in enumerate(sizes) if axis not in gone]
-    found = np.array(windows, int).reshape(*indices.shape[:-1], *shape)
+    found = np.array(windows, int).reshape((*indices.shape[:-1], *shape))
     return [np.moveaxis(found, range(indices.ndim - 1, found.ndim), dims.offset_dims)]
 
 

@@ -433,7 +433,9 @@ def test_a_box_beyond_the_numbers_of_its_dtype(backend):
         ("lengths_or_matrix", jfrnn.Box([[1e39, 0.0], [0.0, 1.0]])),
         ("origin", jfrnn.Box([1.0, 1.0], origin=[1e39, 0.0])),
     ):
-        refuses(ValueError, f"{name} must not exceed 4.3e\\+37, as positions are float32", lambda box=box: jfrnn.count(x, 0.3, box=box))
+        refuses(
+            ValueError, f"{name} must not exceed 4.3e\\+37, as positions are float32", lambda box=box: jfrnn.count(x, 0.3, box=box)
+        )
     assert jfrnn.count(x, 0.3, box=jfrnn.Box([2.0**124, 1.0]), backend=backend).tolist() == [0, 0]
 
 

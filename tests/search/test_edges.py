@@ -154,6 +154,7 @@ X = np.random.default_rng(3).random((24, 3)) * BOX
 BOTH = {
     "padded": lambda: jfrnn.search(X, CUTOFF, box=jfrnn.Box(BOX)).edges(X, 400),
     "flat": lambda: jfrnn.search_edges(X, CUTOFF, box=jfrnn.Box(BOX), total=400).edges(X),
+    "with a skin": lambda: jfrnn.search_edges(X, CUTOFF, skin=0.05, box=jfrnn.Box(BOX), total=400).edges(X),  # among the pairs
 }
 
 
@@ -161,9 +162,10 @@ BOTH = {
 @pytest.mark.parametrize("kind", BOTH)
 def test_triplets_are_pairs_of_edges(kind, half):
     edges = BOTH[kind]()
-    receivers, held = np.asarray(edges.receivers), int(edges.pair_count)
-    assert held < 400  # with padding
-    around = [np.flatnonzero(receivers[:held] == i).tolist() for i in range(len(X))]
+    receivers, there = np.asarray(edges.receivers), np.asarray(edges.mask)
+    assert not there[-1]  # with padding
+    assert there[: int(edges.pair_count)].all() == (kind != "with a skin")
+    around = [np.flatnonzero((receivers == i) & there).tolist() for i in range(len(X))]
     expected = [pair for edge in around for pair in (itertools.combinations if half else itertools.permutations)(edge, 2)]
     room = len(expected) + 7
     found = jax.jit(lambda edges: edges.triplets(room, half=half))(edges)

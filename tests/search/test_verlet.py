@@ -240,6 +240,25 @@ def test_inactive_particles_have_no_neighbors_and_come_and_go(backend, dim):
     refuses(ValueError, "non-finite", nbrs.update(x, active=np.arange(60) < 51).check)
 
 
+@pytest.mark.parametrize("box", [None, jfrnn.Box([1.0, 1.0])], ids=["open", "box"])
+def test_derivatives_in_a_list_are_none(box):
+    """Who differentiates a state that holds a list gets those of the positions."""
+    x = jnp.asarray(np.random.default_rng(4).random((9, 2)))
+    nbrs = jfrnn.search(x, 0.4, skin=0.05, box=box)
+
+    def work(x, nbrs):
+        def step(state, _):
+            x, nbrs = state[0], state[1].update(state[0])
+            return (x - 0.01 * jax.grad(lambda x: nbrs.distances(x)[0].sum())(x), nbrs), None
+
+        return (jax.lax.scan(step, (x, nbrs), None, length=3)[0][0] ** 2).sum()
+
+    both = jax.jit(jax.grad(work, argnums=(0, 1), allow_int=True))(x, nbrs)
+    np.testing.assert_allclose(both[0], jax.grad(work)(x, nbrs), rtol=1e-12)
+    assert all(g.dtype == jax.dtypes.float0 or not g.any() for g in jax.tree.leaves(both[1]))
+    jax.vjp(lambda x, nbrs: nbrs.update(x).distances(x)[0].sum(), x, nbrs)
+
+
 def test_gradients_flow_around_updates():
     x = np.random.default_rng(0).random((30, 2))
 

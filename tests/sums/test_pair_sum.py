@@ -379,6 +379,16 @@ def partly_active():
     return jnp.asarray(x), jnp.asarray(np.where(active, m, np.nan)), active
 
 
+@pytest.mark.parametrize("backend", ["warp", "jax", "brute"])
+def test_sums_without_elements(backend):
+    x = jnp.array([[0.0, 0], [0.5, 0], [-0.4, 0]])
+    found = jfrnn.pair_sum(lambda r, i, j: {"none": jnp.zeros((2, 0), r.dtype), "r": r}, x, 1.0, backend=backend)
+    assert found["none"].shape == (3, 2, 0)
+    np.testing.assert_allclose(found["r"][:, 0], [0.1, -1.4, 1.3], rtol=1e-6)
+    for reduce in ("sum", "max"):
+        assert jfrnn.pair_sum(lambda r, i, j: jnp.zeros(0, r.dtype), x, 1.0, backend=backend, reduce=reduce).shape == (3, 0)
+
+
 @pytest.mark.parametrize("backend", ["warp", "jax", slow("brute")])
 def test_particles_that_are_not_there_have_no_extreme(backend):
     """Nor have those of no system, where each system has a box."""
