@@ -11,7 +11,7 @@ from jax import Array, lax
 
 from jfrnn import _geometry as geometry
 from jfrnn._engine import KeptList, kept_mask
-from jfrnn._search.present import ImageCodes, Present, one_each
+from jfrnn._search.present import ImageCodes, ImagesMade, Present, one_each
 from jfrnn._tracing import call_apart, compile_program, own_transfers
 
 
@@ -190,20 +190,32 @@ def vectors_of(present: Present, as_given: bool = False) -> tuple[Array, Array, 
 
 def kept_list(present: Present) -> KeptList:
     """Return a list as Warp's kernels take it: points near the box, and one lattice, or one per system; all are constants."""
-    topology, box, kind, batch, (codes, made) = present.topology, present.box, present.kind, present.batch, present.images
+    topology, systems, turns, lattice = present.topology, None, None, None
     sources, rows = lax.stop_gradient((present.sources, present.rows))
-    systems, turns, lattice = None, None, None
-    if box is not None and kind is not None:
-        lattice = of_sources = of_rows = geometry.make_lattice(box, kind, np.dtype(sources.dtype))
-        if batch is not None and kind.per_system:
-            most = len(lattice.origin) - 1  # rows without a box get any
-            systems = jnp.clip(batch.sources, 0, most), jnp.clip(batch.of_queries, 0, most)
-            of_sources, of_rows = map(lattice.of_rows, systems)
-        ends = Ends(geometry.bring_near(sources, of_sources), geometry.bring_near(rows, of_rows), of_sources, of_rows)
-        sources, rows = ends.sources.points, ends.rows.points
-        turns = None if codes is None else _turns_now(codes, made, ends)
+    if present.box is not None and present.kind is not None:
+        apart = None if present.rows is present.sources else rows
+        found = _near_box(sources, apart, present.box, present.batch, present.images, present.kind)
+        sources, rows, turns, lattice, systems = found if apart is not None else (found[0], *found)
     fixed = lax.stop_gradient((sources, rows, turns, present.cutoffs, lattice))
     return KeptList(topology.idx, present.count, topology.codes, *fixed, topology.order, None, systems)
+
+
+@functools.partial(compile_program, static_argnames="kind")
+def _near_box(
+    sources: Array, rows: Array | None, box: geometry.Box, batch: geometry.Batch | None, images: ImagesMade, kind: geometry.Images
+) -> tuple:
+    """Return sources and rows, if given, near a box, their turns, the lattice, and with a box per system whose they have."""
+    lattice = of_sources = of_rows = geometry.make_lattice(box, kind, np.dtype(sources.dtype))
+    systems, (codes, made) = None, images
+    if batch is not None and kind.per_system:
+        most = len(lattice.origin) - 1  # rows without a box get any
+        systems = jnp.clip(batch.sources, 0, most), jnp.clip(batch.of_queries, 0, most)
+        of_sources, of_rows = map(lattice.of_rows, systems)
+    near = geometry.bring_near(sources, of_sources)
+    ends = Ends(near, near if rows is None else geometry.bring_near(rows, of_rows), of_sources, of_rows)
+    turns = None if codes is None else _turns_now(codes, made, ends)
+    points = (ends.sources.points,) if rows is None else (ends.sources.points, ends.rows.points)
+    return *points, turns, lattice, systems
 
 
 def kept_shifts(given: KeptList) -> Array:

@@ -104,8 +104,11 @@ def pairs_of_list(
     if known is not None and isinstance(relation, Kept):
         relation = dataclasses.replace(relation, given=relation.given._replace(numbers=known.pairs))
     lattice, sides = _lattice(box, nbrs.box_kind, sources, nbrs.batch)
-    sources, asking = _bring_near(sources, rows if own else None, box, nbrs.box_kind, nbrs.batch)
-    rows = sources if asking is None else asking
+    if isinstance(relation, Kept) and not any(isinstance(x, Tracer) for x in jax.tree.leaves((sources, rows, box))):
+        sources, rows = relation.given.sources, relation.given.rows  # no derivative is taken
+    else:
+        sources, asking = _bring_near(sources, rows if own else None, box, nbrs.box_kind, nbrs.batch)
+        rows = sources if asking is None else asking
     largest = nbrs.cutoff if nbrs.radii is None else geometry.make_cutoffs(lax.stop_gradient(nbrs.radii), nbrs.closed).largest
     masked = nbrs.masked or (nbrs.box is not None and nbrs.box.per_system)
     held = (nbrs.count if isinstance(nbrs, NeighborList) else jnp.diff(nbrs.offsets)) if masked and not own else None

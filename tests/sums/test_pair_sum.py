@@ -379,6 +379,21 @@ def partly_active():
     return jnp.asarray(x), jnp.asarray(np.where(active, m, np.nan)), active
 
 
+@pytest.mark.parametrize("verb", ["sum", "distances", "update"])
+def test_what_is_done_with_a_list_in_a_box_is_compiled_whole(verb, caplog):
+    """Outside of `jax.jit`, operations that are called one by one took a sum over a list in a skewed box two seconds."""
+    x = jnp.asarray(np.random.default_rng(7).random((40 + len(verb), 3)))
+    nbrs = jfrnn.search(x, 0.2, skin=0.01, box=jfrnn.Box([[1.0, 0.0, 0.0], [0.2, 1.0, 0.0], [0.1, 0.1, 1.0]]))
+    calls = {
+        "sum": lambda: jfrnn.pair_sum(lambda r, i, j: r @ r, x, None, neighbors=nbrs),
+        "distances": lambda: nbrs.distances(x),
+        "update": lambda: nbrs.update(x),
+    }
+    with jax.log_compiles():
+        jax.block_until_ready(calls[verb]())
+    assert 1 <= caplog.text.count("Finished XLA compilation") <= 6
+
+
 @pytest.mark.parametrize("backend", ["warp", "jax", "brute"])
 def test_sums_without_elements(backend):
     x = jnp.array([[0.0, 0], [0.5, 0], [-0.4, 0]])
