@@ -130,6 +130,19 @@ def explicit_axes_without_a_context():
 
 
 @check
+def a_box_goes_where_the_points_are():
+    """Also where transfers are guarded: a box of NumPy arrays is brought there by the library itself."""
+    mesh, box = jax.make_mesh((4,), ("p",), axis_types=(AxisType.Auto,)), jfrnn.Box([2.0, 2.0])
+    expected = np.asarray(jfrnn.count(X, 0.5, box=box))
+    for place in (NamedSharding(mesh, PartitionSpec("p")), jax.devices()[3]):
+        x = jax.device_put(X, place)
+        with jax.transfer_guard("disallow"):
+            found = jfrnn.count(x, 0.5, box=box), jfrnn.search(x, 0.5, box=box).count
+        for each in found:
+            np.testing.assert_array_equal(each, expected)
+
+
+@check
 def batches_on_explicit_axes():
     """They are refused, with advice that helps."""
     mesh = jax.make_mesh((4,), ("p",), axis_types=(AxisType.Explicit,))

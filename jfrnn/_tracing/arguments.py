@@ -160,14 +160,14 @@ def _one_of_batch() -> Internal:
 
 
 def own_transfers() -> AbstractContextManager[object]:
-    """Allow the library's own transfers between host and device, like explicit `device_put` and `device_get`.
+    """Allow the library's own transfers between host and devices, like explicit `device_put` and `device_get`.
 
     `jax.transfer_guard("disallow_explicit")` forbids these too. Arrays of users must be on the device before: transferring their
     NumPy arrays is left to them. Whatever enters here works with arrays, so forked processes are refused.
     """
     refuse_forks()
     stack = contextlib.ExitStack()
-    for guard in (jax.transfer_guard_host_to_device, jax.transfer_guard_device_to_host):
+    for guard in (jax.transfer_guard_host_to_device, jax.transfer_guard_device_to_host, jax.transfer_guard_device_to_device):
         if getattr(jax.config, f"jax_{guard.__name__}") in ("disallow", "log"):
             stack.enter_context(guard("allow"))
     return stack
