@@ -82,7 +82,7 @@ def test_a_search_of_a_new_size_compiles_a_count_and_a_list(kind):
 
 
 def test_a_data_set_of_crystals_compiles_two_programs_for_each_number_of_atoms():
-    """A list, and one program for displacements and shifts."""
+    """A list, and one program for displacements and shifts; besides, one for boxes of as many images, whatever they hold."""
     rng = np.random.default_rng(0)
 
     def look(atoms):
@@ -94,6 +94,7 @@ def test_a_data_set_of_crystals_compiles_two_programs_for_each_number_of_atoms()
         np.testing.assert_allclose(np.asarray(displacement)[mask], moved[mask], atol=1e-4)
 
     look(17)
+    look(60)  # in which the nearest image is enough
     for atoms in (20, 27, 34, 41, 48, 55):
         assert compiled_by(look, atoms) <= 2
 
