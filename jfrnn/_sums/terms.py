@@ -164,9 +164,15 @@ def _jaxprs(closed: ClosedJaxpr) -> Iterator[ClosedJaxpr]:
     """Yield a jaxpr and all that stand in it."""
     yield closed
     for equation in closed.jaxpr.eqns:
-        for inner in (x for value in equation.params.values() for x in (value if isinstance(value, tuple) else (value,))):
-            if isinstance(inner, Jaxpr | ClosedJaxpr):
-                yield from _jaxprs(inner if isinstance(inner, ClosedJaxpr) else ClosedJaxpr(inner, ()))
+        for inner in _inner(equation.params):
+            yield from _jaxprs(inner)
+
+
+def _inner(params: dict[str, Any]) -> Iterator[ClosedJaxpr]:
+    """Yield the jaxprs that stand in the parameters of an equation."""
+    for inner in (x for value in params.values() for x in (value if isinstance(value, tuple) else (value,))):
+        if isinstance(inner, Jaxpr | ClosedJaxpr):
+            yield inner if isinstance(inner, ClosedJaxpr) else ClosedJaxpr(inner, ())
 
 
 def _constants(programs: Sequence[ClosedJaxpr]) -> Iterator[bytes]:
@@ -297,6 +303,7 @@ _CLOSED = (
     "fn calls a function with a rule for its derivative (jax.custom_jvp or jax.custom_vjp) that closes over an array which is "
     "being traced or differentiated: hand that array over as an argument of the function."
 )
+_LOOPS = {"scan": "num_consts", "while": "body_nconsts"}  # the parameter that says how many arguments of a body stay as they are
 
 
 def _refuse_constants(jaxpr: Jaxpr, moving: Sequence[bool]) -> None:
@@ -305,10 +312,16 @@ def _refuse_constants(jaxpr: Jaxpr, moving: Sequence[bool]) -> None:
     for equation in jaxpr.eqns:
         name, params = equation.primitive.name, equation.params
         moves = [not isinstance(v, Literal) and v in moved for v in equation.invars]
-        if name.startswith("custom_") and any(moves[: params.get("num_consts", 0)]):
-            raise ValueError(_CLOSED)
-        if name in ("jit", "pjit"):
-            _refuse_constants(params["jaxpr"].jaxpr, moves)
+        if name.startswith("custom_"):
+            if any(moves[: params.get("num_consts", 0)]):
+                raise ValueError(_CLOSED)
+        else:
+            for inner in _inner(params):
+                given = moves[len(moves) - len(inner.jaxpr.invars) :]
+                if name in _LOOPS:  # what is carried may move after a turn
+                    fixed = params[_LOOPS[name]]
+                    given[fixed:] = [any(moves)] * (len(given) - fixed)
+                _refuse_constants(inner.jaxpr, given)
         if any(moves) and name != "stop_gradient":
             moved.update(v for v in equation.outvars if is_moving(v.aval))
 

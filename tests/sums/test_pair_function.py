@@ -151,11 +151,19 @@ def test_rules_in_rules_may_change():
     np.testing.assert_array_equal(after, hessian(lambda r, i, j: fn(r, i, j)))
 
 
-def of_a_rule(x, scale, backend):
+WITHIN = {
+    "": lambda rule, square: rule(square),
+    "jit": lambda rule, square: jax.jit(rule)(square),
+    "cond": lambda rule, square: jax.lax.cond(square > 0, rule, lambda square: square, square),
+    "scan": lambda rule, square: jax.lax.scan(lambda at, _: (rule(at), None), square, None, length=1)[0],
+}
+
+
+def of_a_rule(x, scale, backend, within=""):
     """A sum of (scale - r^2)^3 by a function that closes over `scale`, as its rule does."""
     rule = jax.custom_jvp(lambda square: (scale - square) ** 3)
     rule.defjvp(lambda primals, tangents: (rule(*primals), -3 * (scale - primals[0]) ** 2 * tangents[0]))
-    return jfrnn.pair_sum(lambda r, i, j: rule(r @ r), x, 0.5, backend=backend).sum()
+    return jfrnn.pair_sum(lambda r, i, j: WITHIN[within](rule, r @ r), x, 0.5, backend=backend).sum()
 
 
 @pytest.mark.parametrize("backend", ["warp", "jax"])
@@ -168,3 +176,12 @@ def test_rules_that_close_over_what_moves_are_refused(backend):
     for derivative in (jax.grad(work, 1), jax.jit(jax.grad(work, 1)), jax.grad(jax.jit(work), 1), jax.jit(jax.grad(work))):
         with pytest.raises(ValueError, match=r"fn calls a function with a rule for its derivative .* hand that array over"):
             derivative(x, scale)
+
+
+@pytest.mark.parametrize("within", ["jit", "cond", "scan"])
+def test_rules_in_programs_that_close_over_what_moves_are_refused(within):
+    x, scale = jnp.asarray(np.random.default_rng(0).random((9, 3)), jnp.float32), jnp.float32(0.25)
+    work = functools.partial(of_a_rule, backend="jax", within=within)
+    np.testing.assert_allclose(jax.grad(work)(x, scale), jax.grad(of_a_rule)(x, scale, "jax"), rtol=1e-5)
+    with pytest.raises(ValueError, match="hand that array over"):
+        jax.jit(jax.grad(work, 1))(x, scale)
