@@ -194,8 +194,8 @@ def kept_list(present: Present) -> KeptList:
     sources, rows = lax.stop_gradient((present.sources, present.rows))
     if present.box is not None and present.kind is not None:
         apart = None if present.rows is present.sources else rows
-        found = _near_box(sources, apart, present.box, present.batch, present.images, present.kind)
-        sources, rows, turns, lattice, systems = found if apart is not None else (found[0], *found)
+        sources, rows, turns, lattice, systems = _near_box(sources, apart, present.box, present.batch, present.images, present.kind)
+        rows = sources if rows is None else rows
     fixed = lax.stop_gradient((sources, rows, turns, present.cutoffs, lattice))
     return KeptList(topology.idx, present.count, topology.codes, *fixed, topology.order, None, systems)
 
@@ -203,7 +203,7 @@ def kept_list(present: Present) -> KeptList:
 @functools.partial(compile_program, static_argnames="kind")
 def _near_box(
     sources: Array, rows: Array | None, box: geometry.Box, batch: geometry.Batch | None, images: ImagesMade, kind: geometry.Images
-) -> tuple:
+) -> tuple[Array, Array | None, tuple[Array, Array] | None, geometry.Lattice, tuple[Array, Array] | None]:
     """Return sources and rows, if given, near a box, their turns, the lattice, and with a box per system whose they have."""
     lattice = of_sources = of_rows = geometry.make_lattice(box, kind, np.dtype(sources.dtype))
     systems, (codes, made) = None, images
@@ -214,8 +214,7 @@ def _near_box(
     near = geometry.bring_near(sources, of_sources)
     ends = Ends(near, near if rows is None else geometry.bring_near(rows, of_rows), of_sources, of_rows)
     turns = None if codes is None else _turns_now(codes, made, ends)
-    points = (ends.sources.points,) if rows is None else (ends.sources.points, ends.rows.points)
-    return *points, turns, lattice, systems
+    return ends.sources.points, None if rows is None else ends.rows.points, turns, lattice, systems
 
 
 def kept_shifts(given: KeptList) -> Array:
