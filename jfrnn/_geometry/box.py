@@ -13,7 +13,7 @@ from jax.core import Tracer
 from jfrnn._geometry.reduced import count_cells, short_vectors
 from jfrnn._tracing import Given, as_array, as_dtype, own_transfers
 
-_FLAT = 1e-12  # a cell less high, squared, beside its edges of length 1, is what rounding leaves of none
+_FLAT, _FLAT_ULPS = 1e-12, 16  # the square of a height beside edges of length 1, also in units of eps, that rounding leaves of none
 _SINGULAR = 1e-9  # determinants below may be those of dependent rows
 Numbers = Any  # an array of NumPy or JAX, concrete or traced
 
@@ -240,7 +240,7 @@ def _cell_of(lengths: Given, angles: Given) -> Numbers:
     else:
         along = (cosines[0] - cosines[1] * gamma) / height
         square = 1 - cosines[1] ** 2 - along**2
-        if xp is np and not square > _FLAT:
+        if xp is np and not square > max(_FLAT, _FLAT_ULPS * np.finfo(square.dtype).eps):
             raise ValueError(f"angles must be those of a cell, each less than the sum of the others, got {angles}.")
         rows = [[1 + nothing, nothing, nothing], [gamma, height, nothing], [cosines[1], along, xp.sqrt(square)]]
     return xp.stack([xp.stack(row) for row in rows]).astype(sizes.dtype) * sizes[:, None]

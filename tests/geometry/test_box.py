@@ -453,6 +453,7 @@ def test_cells_from_lengths_and_angles():
         (ValueError, "Box.from_parameters", lambda: jfrnn.Box([1.0, 2.0, 3.0, 90.0, 90.0, 90.0])),
         (ValueError, "less than the sum of the others", lambda: jfrnn.Box.from_parameters([1.0, 2.0, 3.0], [10.0, 20.0, 150.0])),
         (ValueError, "less than the sum of the others", lambda: jfrnn.Box.from_parameters([1.0] * 3, [60.0, 60.0, 120.0])),  # flat
+        (ValueError, "less than the sum of the others", lambda: jfrnn.Box.from_parameters([1.0] * 3, np.float32([85, 60, 145]))),
         (ValueError, "between 0 and 180", lambda: jfrnn.Box.from_parameters([1.0, 2.0, 3.0], [10.0, 20.0, 180.0])),
         (ValueError, r"lengths and angles must have shape \[3\] each", lambda: jfrnn.Box.from_parameters([1.0, 2.0, 3.0], 90.0)),
     ):
