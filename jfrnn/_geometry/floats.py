@@ -56,6 +56,37 @@ def unit_scale(x: Array) -> Array:
     return lax.bitcast_convert_type(jnp.maximum(unsigned(2 * bias) - exponent, unsigned(1)) << unsigned(nmant), x.dtype)
 
 
+def rounded_quotient(x: Array, y: Array) -> Array:
+    """Return x / y, y normal and positive, as IEEE 754 rounds it; GPUs divide float32 with errors of up to two units.
+
+    Quotients below 1/2 or beyond 2^60 are those of the device.
+    """
+    scale = unit_scale(y)
+    return settled_quotient(x * scale, y * scale, (x * scale) / lax.optimization_barrier(y * scale))
+
+
+def settled_quotient(x: Array, y: Array, quotient: Array) -> Array:
+    """Return x / y, y in [1, 4), rounded to nearest, from a quotient that is a few units off.
+
+    What remains of x tells the quotient to within a unit. The remainders of this float and of its neighbor are then floats
+    themselves (Markstein 1990, doi:10.1147/rd.341.0111), and the nearer one has the smaller remainder.
+    """
+    within = (jnp.abs(quotient) >= 0.5) & (jnp.abs(quotient) < 2.0**60)
+    near = jnp.where(within, quotient, 1)  # so that no other quotient makes a remainder that overflows
+    x = jnp.where(within, x, y)
+    near = near + _remainder(x, y, near) / y
+    left = _remainder(x, y, near)
+    beside = jnp.nextafter(near, jnp.where(left < 0, -jnp.inf, jnp.inf).astype(near.dtype))
+    near = jnp.where(jnp.abs(_remainder(x, y, beside)) < jnp.abs(left), beside, near)
+    return jnp.where(within, near, quotient)
+
+
+def _remainder(x: Array, y: Array, quotient: Array) -> Array:
+    """Return x - quotient * y with one rounding or so: products of half mantissas are exact."""
+    *errors, total = distill([x, *(-q * part for q in _halves(quotient) for part in _halves(y))])
+    return rounded_sum(total, functools.reduce(jnp.add, errors))
+
+
 @jax.custom_jvp
 def rounded_scaled(points: Array, sizes: Array) -> Array:
     """Return points * sizes, [n, d], with one rounding, which all that use it see: no product is contracted with a sum."""

@@ -11,6 +11,7 @@ from jax import Array, lax
 from jax.core import Tracer
 
 from jfrnn._geometry.curves import Words, hilbert_digits, hilbert_words, morton_words, spread
+from jfrnn._geometry.floats import rounded_quotient
 from jfrnn._geometry.inputs import check_positions
 from jfrnn._tracing import Given, Number, Points, compile_program, on_device, own_transfers
 
@@ -86,7 +87,7 @@ def _cells_from_lowest(x: Array, size: Array, finite: Array) -> list[Array]:
     largest = jnp.max(jnp.abs(x), axis=1, initial=0)
     ahead = jnp.maximum(_exponent(largest) - _exponent(size) - _DISTINCT, 0)
     edge = jnp.broadcast_to(_times_power_of_two(size, ahead)[:, None], x.shape)
-    cells = jnp.floor(x / lax.optimization_barrier(edge))  # by one number, XLA would multiply with its rounded reciprocal
+    cells = jnp.floor(rounded_quotient(x, edge))
     cells = jnp.where(x < 0, jnp.minimum(cells, -1), cells)  # otherwise a quotient that underflows would be in cell 0
     lowest = jnp.min(cells, axis=1, initial=jnp.inf, where=finite)
     span = jnp.max(cells, axis=1, initial=-jnp.inf, where=finite) - lowest  # -inf if there is no particle
