@@ -27,7 +27,7 @@ def warps(queries: int) -> int:
 
 
 def blocks(queries: int) -> int:
-    """Return the blocks of a launch: of so many, `info` has a row each."""
+    """Return the blocks of a launch."""
     return -(-queries // warps(queries))
 
 

@@ -45,7 +45,7 @@ _GIVEN = ("positions", "queries", "boxes", "axes", "systems", "ids", "cells", "s
 def box_neighbors(search: Search, keep: Filter, capacity: int | Room | None) -> Rows:
     """List the neighbors of every query, or only count them (capacity=None), where each system has a box of its own."""
     kind, m = kind_of_search(search, keep, capacity), search.sizes[1]
-    dims = {**row_dims(m, capacity), "count": m, "info": 2}
+    dims = {**row_dims(m, capacity), "count": m, "longest": (), "bits": ()}
     starts = [capacity.starts] if isinstance(capacity, Room) else []
 
     def on_cpu(search: Search, *starts: Array) -> list[Array]:
@@ -58,8 +58,8 @@ def box_neighbors(search: Search, keep: Filter, capacity: int | Room | None) -> 
         given += [*excluded_rows(search), *_cutoffs_of_pairs(search, given[_GIVEN.index("ids")])]
         return _cuda_callable(kind)(*given, *starts, output_dims=dims)
 
-    *written, count, info = on_platform(search, *starts, cpu=on_cpu, cuda=on_cuda)
-    return found_rows(written, count, info[0], capacity)
+    *written, count, longest, _ = on_platform(search, *starts, cpu=on_cpu, cuda=on_cuda)
+    return found_rows(written, count, longest, capacity)
 
 
 # --- on the CPU, by the kernels of cells ----------------------------------------------------------------------------------
@@ -185,7 +185,7 @@ def _kinds(shapes: Shapes) -> int:
 
 def _plan_on_cuda(kind: Kind, shapes: Shapes, _: int) -> Plan:
     numbers, m = plan_numbers(kind, shapes) | {"stride": shapes["axes"][1], "kinds": _kinds(shapes)}, shapes["queries"][0]
-    return Plan([Clear("info", 8), Launch(boxes.rows_kernel(kind), boxes.threads(m))], numbers, absent(kind))
+    return Plan([Clear("longest", 4), Launch(boxes.rows_kernel(kind), boxes.threads(m))], numbers, absent(kind))
 
 
 # --- sums ----------------------------------------------------------------------------------------------------------------
@@ -199,7 +199,7 @@ def box_sums(search: Search, keep: Filter, summed: Summed, values: Values) -> Fo
     def on_cpu(search: Search, values: Values) -> FoundSums:
         results, scratch = SumsOf(term, kind, m, pair_sum_cpu.slots(m)), _scratch_dims(search)
         columns = max(pair_sum_cpu.sorted_numbers(term, n, kind.dim, kind.double), 1)
-        dims = results.dims() | {"columns": columns, "info": 2} | scratch
+        dims = results.dims() | {"columns": columns, "bits": ()} | scratch
         given = [*_particles(search), *values.beside_rows, *excluded_rows(search), *_cutoffs_of_particles(search)]
         return results.unpack(*_cpu_sum_callable(kind, term, key)(*given, output_dims=dims)[: len(SUMS)])
 
@@ -209,7 +209,7 @@ def box_sums(search: Search, keep: Filter, summed: Summed, values: Values) -> Fo
         given += [values.shared, values.own, _sorted_columns(search, term, values.others, ids)]
         given += [*excluded_rows(search), *_cutoffs_of_pairs(search, ids)]
         call_sums = _cuda_sum_callable(kind, term, key)
-        return results.unpack(*call_sums(*given, output_dims=results.dims() | {"info": 2})[: len(SUMS)])
+        return results.unpack(*call_sums(*given, output_dims=results.dims())[: len(SUMS)])
 
     return on_platform(search._replace(checks={}), values, cpu=on_cpu, cuda=on_cuda)
 
@@ -229,7 +229,7 @@ _VALUES = ("shared_values", "own_values")
 
 @kernel
 def _cpu_sum_callable(kind: Kind, term: TermText, key: str) -> Call:
-    more = {"columns": scalar_of(kind), **dict.fromkeys(("info", "scratch", "grids"), np.int32)}
+    more = {"columns": scalar_of(kind), **dict.fromkeys(("bits", "scratch", "grids"), np.int32)}
     given, plan = ("positions", "queries", "cutoff", *_VALUES, "others"), functools.partial(_plan_sums_on_cpu, kind, term, key)
     return describe_sums("box_sums_cpu", kind, key, plan, given, more)
 
@@ -245,7 +245,7 @@ def _plan_sums_on_cpu(kind: Kind, term: TermText, key: str, shapes: Shapes, _: i
 @kernel
 def _cuda_sum_callable(kind: Kind, term: TermText, key: str) -> Call:
     given, plan = (*_GIVEN, *_VALUES, "columns"), functools.partial(_plan_sums_on_cuda, kind, term, key)
-    return describe_sums("box_sums_cuda", kind, key, plan, given, {"info": np.int32}, names_of_cutoffs)
+    return describe_sums("box_sums_cuda", kind, key, plan, given, cutoffs=names_of_cutoffs)
 
 
 def _plan_sums_on_cuda(kind: Kind, term: TermText, key: str, shapes: Shapes, _: int) -> Plan:

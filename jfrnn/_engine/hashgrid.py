@@ -86,7 +86,7 @@ def _hashgrid_callable(kind: Kind, radius: float, cuda: bool) -> Call:
         kernels = hashgrid.search_kernels(kind, cuda)
         rows = [] if cuda else huge_pages(kind, shapes)
         pack, query = Launch(kernels.pack, n if cuda else 1), Launch(kernels.query, m if cuda else 1)
-        steps = [Clear("info", 8), pack, Launch(hashgrid.build_kernel(kind.double)), *rows, query]
+        steps = [Clear("longest", 4), Clear("bits", 4), pack, Launch(hashgrid.build_kernel(kind.double)), *rows, query]
         return Plan(steps, numbers, absent(kind), functools.partial(_keep_grid, grid, kind.double, n))
 
     found = describe_call("hashgrid_cuda" if cuda else "hashgrid_cpu", kind, plan)

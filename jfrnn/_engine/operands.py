@@ -184,9 +184,9 @@ def describe_call(
     """Return what XLA calls for rows or counts: its name tells the kernels, and all that is static.
 
     It is `given` arrays of these names, then those of exclusions and of cutoffs that differ, by a function of the rule; it writes
-    rows, counts, `info` and `more`.
+    rows, counts, the length of the longest row, bits of the status and `more`.
     """
-    results = [*["idx"] * kind.lists, *["receivers"] * kind.flat, "count", "info", *more]
+    results = [*["idx"] * kind.lists, *["receivers"] * kind.flat, "count", "longest", "bits", *more]
     of_cutoffs = cutoffs(kind.rule) if kind.rule else ()
     given = (*given, *EXCLUDED * bool(kind.excluding), *of_cutoffs, *["starts"] * kind.flat)
     return Call(f"jfrnn_{name}_{kind.name}", given, dict.fromkeys(results, np.int32), plan)

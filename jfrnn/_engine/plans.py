@@ -21,9 +21,10 @@ if TYPE_CHECKING:
 
 PLACES_PER_THREAD = 512  # below, a second thread costs more than it saves
 _HUGE = 1 << 22  # bytes from which an array is worth a request for huge pages
-_MOST_BYTES, _MOST_ARRAYS, MOST_WORDS, _MOST_RECORDED, _MOST_ASKED = 1024, 48, 1024, 8, 1024  # those of the native code
+_MOST_BYTES, _MOST_ARRAYS, MOST_WORDS, _MOST_RECORDED, _MOST_ASKED = 1024, 48, 1024, 32, 1024  # those of the native code
 _ONCE, _SHARED, _CUDA, _CUDA_BESIDE, _CLEAR, _HUGE_PAGES = range(6)
-_MAY_LACK = (*EXCLUDED, *TABLE, "radii", "query_radii", "grids")  # arguments that kernels name, and some of them do not read
+# arguments that kernels name, and some of them do not read
+_MAY_LACK = (*EXCLUDED, *TABLE, "radii", "query_radii", "grids", "longest")
 _STREAM = "stream"  # the name of an argument that gets the stream of the call, as if that were an array
 
 

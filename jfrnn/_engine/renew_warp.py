@@ -178,7 +178,7 @@ def renew_list(inputs: Inputs, options: Options, kept: KeptRows, limit: np.float
         made = {"positions": (n, dim + 1), "cutoff": numbers.shape[1] - 1}
     written |= {"order": kept.order} if ordered else {}
     words = (few_cuda if few else cells_cuda).scratch_words(n, n, dim, 2 if variant.double else 1, True)
-    made |= {"info": (few_cuda.blocks(n) if few else 1, 2), "scratch": max(words, 1), "stale": blocks, "parts": (blocks, 2)}
+    made |= {"longest": (), "bits": (), "scratch": max(words, 1), "stale": blocks, "parts": (blocks, 2)}
     dims = {name: x.shape for name, x in written.items()} | made
     found = _renew_callable(variant, few, ordered)(*operands, *written.values(), output_dims=dims)
     new = dict(zip(written, found, strict=False))
@@ -198,7 +198,7 @@ def _renew_callable(variant: Kind, few: bool, ordered: bool) -> Call:
     boxed, real = variant.periodic > 0, np.float64 if variant.double else np.float32
     floats = ["reference", *_KEPT_OF_BOX * boxed, *["positions", "cutoff"] * boxed]
     kept = [*_KEPT, *_KEPT_OF_BOX * boxed, *["order"] * ordered]
-    results = [*kept, *["positions", "cutoff"] * boxed, "info", "scratch", "stale", "parts"]
+    results = [*kept, *["positions", "cutoff"] * boxed, "longest", "bits", "scratch", "stale", "parts"]
     given = ["now", "limit", *(["cutoffs", "vectors", "origin"] if boxed else ["cutoff"])]
     before = {name: f"{name} before" for name in kept}
     plan = functools.partial(_plan, variant, few, ordered)
@@ -216,6 +216,6 @@ def _plan(variant: Kind, few: bool, ordered: bool, shapes: Shapes, multiprocesso
     blocks = renew.blocks(n)
     check, prepare, keep = (Launch(each, blocks * renew.BLOCK) for each in (around.check, around.prepare, around.keep))
     steps = [check, prepare, Launch(around.settle, renew.BLOCK), *search.steps, keep]
-    numbers = {**search.numbers, "blocks": blocks, "answers": shapes["info"][0]}
+    numbers = {**search.numbers, "blocks": blocks}
     lacking = [*["order"] * (not ordered), *["cutoffs", "vectors", "origin", *_KEPT_OF_BOX] * (not boxed)]
     return search._replace(steps=steps, numbers=numbers, absent=[*search.absent, *lacking], asked="stale", same=same)

@@ -11,7 +11,6 @@ from types import ModuleType
 from typing import Any, TypeVar
 
 import jax.numpy as jnp
-import numpy as np
 from jax import Array, lax
 
 from jfrnn._engine.boxes_warp import box_neighbors
@@ -81,11 +80,8 @@ class WarpEngine:
             return self._rows_of_cutoffs(search._replace(checks={}), options.filter, capacity)
 
         def on(module: ModuleType, make: Callable[[Kind], Any]) -> Callable[[Search], Rows]:
-            blocks = few_cuda.blocks(search.sizes[1]) if module is few_cuda else None
             order = functools.partial(_order_in, module, search) if options.ordered and isinstance(capacity, int) else None
-            return functools.partial(
-                call_kernels, module.scratch_words, make, keep=options.filter, capacity=capacity, blocks=blocks, order=order
-            )
+            return functools.partial(call_kernels, module.scratch_words, make, keep=options.filter, capacity=capacity, order=order)
 
         few = are_few(search)
         cpu, cuda = on(cells_cpu, _cpu_callable), on(few_cuda, _few_callable) if few else on(cells_cuda, _cuda_callable)
@@ -235,14 +231,12 @@ def call_kernels(
     *,
     keep: Filter,
     capacity: int | Room | None,
-    blocks: int | None = None,
     order: Callable[[Array], Array] | None = None,
     given: Given | None = None,
 ) -> Rows:
     """Let XLA call what `make` returns, with the scratch that its kernels ask for.
 
-    With `blocks`, so many tell of their own queries how long rows are, and their status; otherwise one tells of all. `order` finds
-    the order of the sources in that scratch, `given` what kernels are given besides.
+    `order` finds the order of the sources in that scratch, `given` what kernels are given besides.
     """
     kind, (n, m) = kind_of_search(search, keep, capacity), search.sizes
     of_particles = cutoffs_of_particles(search.cutoff) if isinstance(search.cutoff, Cutoffs) else {}
@@ -251,17 +245,14 @@ def call_kernels(
             f"backend='warp' numbers at most {MOST_IN_BOX - 1} positions in a periodic box, got {n}: pass backend='jax'."
         )
     words = scratch_words(n, m, kind.dim, 2 if kind.double else 1, kind.own)
-    dims = {**row_dims(m, capacity), "count": m, "info": 2 if blocks is None else (blocks, 2), "scratch": max(words, 1)}
+    dims = {**row_dims(m, capacity), "count": m, "longest": (), "bits": (), "scratch": max(words, 1)}
     more = {} if given is None else given(search)
     operands = [*pack_particles(search), *excluded_rows(search), *of_particles.values(), *more.values()]
     if isinstance(capacity, Room):
         operands.append(capacity.starts)
-    *written, count, info, scratch = make(kind)(*operands, output_dims=dims)
-    longest, status = (
-        (info[0], info[1]) if blocks is None else (info[:, 0].max(), lax.reduce(info[:, 1], np.int32(0), lax.bitwise_or, (0,)))
-    )
+    *written, count, longest, bits, scratch = make(kind)(*operands, output_dims=dims)
     order_found = None if order is None else order(scratch)
-    return Rows(**split_rows(written), counts=count, required=longest, status=status, order=order_found)
+    return Rows(**split_rows(written), counts=count, required=longest, status=bits, order=order_found)
 
 
 @kernel
@@ -301,13 +292,13 @@ def _plan_tree_on_cuda(kind: Kind, shapes: Shapes, _: int) -> Plan:
     numbers = plan_numbers(kind, shapes)
     query = tree_cuda.query_kernel(kind, cells_cuda.lanes_of_query(numbers["m"]))
     walk = Launch(query, tree_cuda.walk_threads(numbers["m"]), {"of_queries": 0})
-    return Plan([*fit_tree(tree_cuda.fit_kernel(kind), numbers), walk], numbers, absent(kind))
+    return Plan([Clear("longest", 4), *fit_tree(tree_cuda.fit_kernel(kind), numbers), walk], numbers, absent(kind))
 
 
 def fit_tree(fit: Kernel, numbers: Mapping[str, int]) -> list[Clear | Launch]:
     """Return what fits a tree on CUDA to the sources, level by level, of numbers of a plan."""
     threads = tree_cuda.fit_threads(numbers["n"], numbers["m"], bool(numbers["own"]))
-    clear = [Clear("info", 8), Clear("scratch", tree_cuda.HEADER_BYTES)]
+    clear = [Clear("bits", 4), Clear("scratch", tree_cuda.HEADER_BYTES)]
     return [*clear, *(Launch(fit, each, {"level": level}) for level, each in enumerate(threads))]
 
 
@@ -316,7 +307,7 @@ def plan_few(kind: Kind, shapes: Shapes, _: int) -> Plan:
     numbers = plan_numbers(kind, shapes)
     numbers["drop_self"] &= kind.own
     query = few_cuda.rows_kernel(kind, few_cuda.warps(numbers["m"]))
-    return Plan([Launch(query, few_cuda.threads(numbers["m"]))], numbers, absent(kind))
+    return Plan([Clear("longest", 4), Clear("bits", 4), Launch(query, few_cuda.threads(numbers["m"]))], numbers, absent(kind))
 
 
 def place_launches(launches: Sequence[cells_cuda.Launch]) -> list[Launch]:

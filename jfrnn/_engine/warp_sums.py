@@ -31,7 +31,7 @@ from jfrnn._tracing import on_platform
 from jfrnn.kernels import Kind, cells_cpu, cells_cuda, few_cuda, pair_sum_cpu, pair_sum_cuda, tree_cpu, tree_cuda
 
 _GIVEN = ("positions", "queries", "cutoff", "shared_values", "own_values", "others")  # what a call is given
-_WORDS = {"info": np.int32, "scratch": np.int32}  # what is written where particles are sorted
+_WORDS = {"bits": np.int32, "scratch": np.int32}  # what is written where particles are sorted
 
 
 def pair_sums(search: Search, keep: Filter, summed: Summed, values: Values) -> FoundSums:
@@ -54,7 +54,7 @@ def pair_sums(search: Search, keep: Filter, summed: Summed, values: Values) -> F
             if not cuda:
                 results = SumsOf(term, kind, m, pair_sum_cpu.slots(m))
                 words = (tree_cpu if kind.rule else cells_cpu).scratch_words(n, m, kind.dim, width, kind.own)
-                dims = {"columns": max(pair_sum_cpu.sorted_numbers(term, n, kind.dim, double), 1), "info": 2, "scratch": words}
+                dims = {"columns": max(pair_sum_cpu.sorted_numbers(term, n, kind.dim, double), 1), "bits": (), "scratch": words}
                 make, given = _cpu_callable(kind, term, key), [*values.beside_rows, *more]
             elif not kind.rule and are_few(search):
                 results, dims = SumsOf(term, kind, m, few_cuda.slots(m)), {}
@@ -83,7 +83,7 @@ def sort_particles(kind: Kind, particles: tuple[Array, Array, Array], given: lis
     words = (tree_cuda if kind.tree else cells_cuda).scratch_words(n, m, kind.dim, 2 if kind.double else 1, kind.own)
     more = ("rule", "tree") if kind.tree or kind.long else ()
     kind = kind.only("scaled", "own", "periodic", "batched", *more)
-    return _sorting_callable(kind)(*particles, *given, output_dims={"info": 2, "scratch": words})
+    return _sorting_callable(kind)(*particles, *given, output_dims={"bits": (), "scratch": words})
 
 
 @kernel

@@ -24,8 +24,8 @@ struct BoxRows : BoxLanes<BoxRows>, RowsOut {
         if (lane > 0)
             return;
         count[query] = all;
-        if (all > *(volatile int*)&info[0])
-            atomicMax(&info[0], all);
+        if (all > *(volatile int*)longest)
+            atomicMax(longest, all);
     }
     // Those that are neighbors go into the row, by their lanes.
     JFRNN_MEMBER void take(bool hit, int at, const BoxRun& run) {

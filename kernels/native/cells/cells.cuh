@@ -11,7 +11,7 @@ struct SearchArguments {
     const int *excluded_starts, *excluded, *starts;
     const real *radii, *query_radii, *table_of_kinds;
     const int *kinds_of_sources, *kinds_of_queries;
-    int *idx, *receivers, *count, *info, *scratch;
+    int *idx, *receivers, *count, *longest, *bits, *scratch;
     int n, m, own, table, capacity, closed, drop_self, of_queries, kinds;
 };
 struct Shared {
@@ -194,7 +194,9 @@ struct Search : SearchArguments, Cells, Thread, Shares, Scratch {
         if (thread == 0) {
             shared.behind[0] = shared.behind[1] = shared.tiles[0] = shared.tiles[1] = shared.crossing = shared.longs = 0;
             shared.scattered = 0;
-            info[0] = info[1] = 0;
+            *bits = 0;
+            if (longest)  // of a sum there is none
+                *longest = 0;
         }
     }
 
@@ -256,7 +258,7 @@ struct Search : SearchArguments, Cells, Thread, Shares, Scratch {
                 shared.grid = grid;
                 shared.unit = lattice_unit(lowest, highest);
                 if (finite < n)
-                    atomicOr(&info[1], 2);
+                    atomicOr(bits, 2);
             }
         }
         __syncthreads();
@@ -299,7 +301,7 @@ struct Search : SearchArguments, Cells, Thread, Shares, Scratch {
         if (lane == first) {
             from = atomicAdd(&shared.behind[of_queries], __popc(asking));
             if (of_queries)
-                atomicOr(&info[1], 2);
+                atomicOr(bits, 2);
         }
         return __shfl_sync(asking, from, first) + __popc(asking & ((1u << lane) - 1));
     }

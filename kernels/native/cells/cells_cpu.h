@@ -89,7 +89,7 @@ struct Places : SystemCells, Scratch {
 
 struct SortArguments {
     const real *positions, *queries, *cutoff;
-    int *info, *scratch, *grids;
+    int *longest, *bits, *scratch, *grids;
     int n, m, own, table;
 };
 
@@ -112,7 +112,8 @@ struct Sort : SortArguments, Places {
         }
         shared.next_chunk = 0;
         shared.next_gathered = shared.next_sorted = 0;
-        info[0] = 0;
+        if (longest)  // of a sum there is none
+            *longest = 0;
         note_turns();
         int lowest = 1 << 20, highest = 0;
         look_at_bits(positions, n, lowest, highest);
@@ -122,7 +123,7 @@ struct Sort : SortArguments, Places {
         grid.finite = sort(grid, positions, n, start, ids, true);
         shared.grid = grid;
         shared.finite_queries = own ? grid.finite : sort(grid, queries, m, query_start, query_ids, false);
-        info[1] = grid.finite < n || shared.finite_queries < m ? 2 : 0;
+        *bits = grid.finite < n || shared.finite_queries < m ? 2 : 0;
     }
 
     // Finds the bounds of all sources with finite coordinates, and returns how many these are. Where the whole box is periodic, the

@@ -1,5 +1,4 @@
-// Rows of neighbors, or their counts, of few particles on CUDA. Each block has a row of `info`: the length of the longest row of its
-// queries, and the bits of their status. Nothing has to be cleared before.
+// Rows of neighbors, or their counts, of few particles on CUDA. `longest` and `bits` are 0 before.
 #pragma once
 #include "few.cuh"
 #include "row_places.h"
@@ -54,15 +53,18 @@ struct FewRows : FewRowsArguments {
             for (unsigned int rest = near[k][threadIdx.x]; rest && slot < room; rest &= rest - 1)
                 write_slot(idx, receivers, begin + slot++, pairs.first_of(k) + __ffs(rest) - 1, pairs.query);
     }
-    // Writes the row of `info` of this block.
-    JFRNN_MEMBER void tell(int lane, int longest, bool not_finite) const {
+    // Adds what this block has met: the longest of its rows, `most` of a lane, and whether a particle is not finite.
+    JFRNN_MEMBER void tell(int lane, int most, bool not_finite) const {
         for (int step = 16; step > 0; step /= 2) {
-            const int other = __shfl_down_sync(EVERY, longest, step);
-            longest = other > longest ? other : longest;
+            const int other = __shfl_down_sync(EVERY, most, step);
+            most = other > most ? other : most;
         }
         if (lane > 0)
             return;
-        info[2 * blockIdx.x] = longest;
-        info[2 * blockIdx.x + 1] = (not_finite ? 2 : 0) | (LIST && !FLAT && longest > capacity ? 1 : 0);
+        if (most > *(volatile int*)longest)
+            atomicMax(longest, most);
+        const int met = (not_finite ? 2 : 0) | (LIST && !FLAT && most > capacity ? 1 : 0);
+        if (met)
+            atomicOr(bits, met);
     }
 };

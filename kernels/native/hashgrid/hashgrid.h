@@ -1,6 +1,6 @@
 // Search with `wp.HashGrid`, which Warp's own header (`warp/native/hashgrid.h`) queries.
 //
-// On CUDA a thread serves a query, on the CPU they are served one after the other. `info` is zeros at first.
+// On CUDA a thread serves a query, on the CPU they are served one after the other. `longest` and `bits` are 0 at first.
 #pragma once
 #include "band.h"
 #include "row_places.h"
@@ -80,10 +80,10 @@ struct HashGridSearch : HashGridArguments, Space {
             work((int)k);
     }
     JFRNN_MEMBER void tell(int found, int state) const {
-        if (found > *(volatile int*)&info[0])  // rarely true, and it spares an atomic operation
-            atomicMax(&info[0], found);
+        if (found > *(volatile int*)longest)  // rarely true, and it spares an atomic operation
+            atomicMax(longest, found);
         if (state)
-            atomicOr(&info[1], state);
+            atomicOr(bits, state);
     }
 #else
     template <class Work>
@@ -92,8 +92,8 @@ struct HashGridSearch : HashGridArguments, Space {
             work(k);
     }
     void tell(int found, int state) const {
-        info[0] = found > info[0] ? found : info[0];
-        info[1] |= state;
+        *longest = found > *longest ? found : *longest;
+        *bits |= state;
     }
 #endif
 };

@@ -10,12 +10,12 @@ struct RenewArguments {
     const real* limit;    // [1] the square of a motion below which a list holds
     const real* cutoffs;  // a row of LATTICE_END + 1 for each number of turns: what a search is given; whether it is enough
     const real *vectors, *origin;                    // [DIM] of the box
-    const int *info, *scratch;                       // what the search has found
+    const int *longest, *bits, *scratch;             // what the search has found
     real *reference, *kept_vectors, *kept_origin;    // kept: [n, DIM] and [DIM]
     int *status, *required, *rebuild_count, *order;  // kept: [1], and [n]
     real *positions, *cutoff;                        // scratch: [n, ROW] and [LATTICE_END], what the search is given
     int *stale, *parts;                              // scratch: [blocks] and [blocks, 2]
-    int n, blocks, answers;                          // `info` has a row for each of so many answers
+    int n, blocks;
 };
 
 struct Renew : RenewArguments {
@@ -98,26 +98,16 @@ struct Renew : RenewArguments {
         if constexpr (ORDERED)
             for (long long i = thread_index(); i < n; i += (long long)blocks * BLOCK)
                 order[i] = parts[1] > n / 2 ? -1 : scratch[FIRST_PLACE + PLACE_WORDS * i + PLACE_WORD];
-        if (blockIdx.x > 0)
+        if (blockIdx.x > 0 || threadIdx.x > 0)
             return;
-        __shared__ int longest, bits;
-        if (threadIdx.x == 0)
-            longest = bits = 0;
-        __syncthreads();
-        for (int k = threadIdx.x; k < answers; k += BLOCK) {
-            atomicMax(&longest, info[2 * k]);
-            atomicOr(&bits, info[2 * k + 1]);
-        }
-        __syncthreads();
-        if (threadIdx.x > 0)
-            return;
+        int found = *bits;
         if constexpr (PERIODIC) {
-            bits =
-                (bits & ~BIT_NOT_FINITE) | (met & MET_NOT_FINITE ? BIT_NOT_FINITE : 0) | (met & MET_TOO_FAR ? BIT_OUT_OF_RANGE : 0);
-            bits |= cutoffs[row_of(met) * (LATTICE_END + 1) + LATTICE_END] != 0 ? 0 : BIT_BOX_TOO_SMALL;
+            found &= ~BIT_NOT_FINITE;
+            found |= (met & MET_NOT_FINITE ? BIT_NOT_FINITE : 0) | (met & MET_TOO_FAR ? BIT_OUT_OF_RANGE : 0);
+            found |= cutoffs[row_of(met) * (LATTICE_END + 1) + LATTICE_END] != 0 ? 0 : BIT_BOX_TOO_SMALL;
         }
-        *status |= bits;
-        *required = longest > *required ? longest : *required;
+        *status |= found;
+        *required = *longest > *required ? *longest : *required;
         *rebuild_count += 1;
     }
 

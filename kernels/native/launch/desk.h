@@ -9,7 +9,7 @@ enum Kind { ONCE, SHARED, CUDA, CUDA_BESIDE, CLEAR, HUGE_PAGES };  // ONCE: on t
 
 // In place of a CUDA device; SOON: a program is being made, most likely for the first device that the process uses.
 static constexpr int ON_CPU = -1, CUDA_SOON = -2, CPU_SOON = -3;
-static constexpr int MOST_ARRAYS = 48, MOST_BYTES = 1024, MOST_WORDS = 1024, MOST_RECORDED = 8, MOST_ASKED = 1024;
+static constexpr int MOST_ARRAYS = 48, MOST_BYTES = 1024, MOST_WORDS = 1024, MOST_RECORDED = 32, MOST_ASKED = 1024;
 
 struct Step {
     void* function;                  // CPU: called with the address of the arguments; CUDA: a function of the driver

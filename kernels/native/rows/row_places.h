@@ -9,7 +9,7 @@
 struct RowsOut {
     const int* starts;
     int *idx, *receivers, *count;  // the last one is of each row
-    int* info;                     // of all rows: the length of the longest one, and bits of the status
+    int *longest, *bits;           // of all rows: the length of the longest one, and bits of the status
     int capacity, later_only;
 };
 

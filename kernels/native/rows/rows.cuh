@@ -79,9 +79,9 @@ struct Rows : Walk<Rows> {
             count[group.my_id] = found;
         const int longest_row = __reduce_max_sync(ALL, lane < group.size ? found : 0);
         if (lane == 0 && longest_row > shared_known().longest_before) {
-            atomicMax(&info[0], longest_row);
+            atomicMax(longest, longest_row);
             if (LIST && !FLAT && longest_row > capacity)
-                atomicOr(&info[1], 1);
+                atomicOr(bits, 1);
         }
     }
     // Writes the pairs that are held into the rows.

@@ -12,11 +12,11 @@ struct RowsBy : Way<RowsBy<Way>>, RowsOut {
     typedef Way<RowsBy<Way>> Base;
     using Base::filled, Base::m, Base::n, Base::lattice, Base::row;
     static constexpr bool FLUSHED = false;
-    int longest;
+    int most;  // of a row that this thread has found
     int fill_value;
     bool past_caches;  // rows are so many that they will not be read from the caches
 
-    explicit RowsBy(const RowArguments& a) : Base(a), RowsOut(a), longest(0), past_caches((long long)m * capacity >= 1 << 20) {
+    explicit RowsBy(const RowArguments& a) : Base(a), RowsOut(a), most(0), past_caches((long long)m * capacity >= 1 << 20) {
         int codes = 1;  // of images
         for (int k = 0; PERIODIC == 2 && k < DIM; ++k)
             codes *= 2 * lattice.images(k) + 1;
@@ -37,7 +37,7 @@ struct RowsBy : Way<RowsBy<Way>>, RowsOut {
                 write_row(id, before, hits, finished);
         }
         count[id] = before + hits;
-        longest = before + hits > longest ? before + hits : longest;
+        most = before + hits > most ? before + hits : most;
     }
     void expect(int) const {}
     void none(int id) {
@@ -48,11 +48,10 @@ struct RowsBy : Way<RowsBy<Way>>, RowsOut {
     void copied(int, unsigned int) {}
     void chunk_done(int) {}
     void finish() {
-        int known = __atomic_load_n(&info[0], __ATOMIC_RELAXED);
-        while (
-            known < longest && !__atomic_compare_exchange_n(&info[0], &known, longest, true, __ATOMIC_RELAXED, __ATOMIC_RELAXED)) {}
-        if (LIST && !FLAT && longest > capacity)
-            __atomic_fetch_or(&info[1], 1, __ATOMIC_RELAXED);
+        int known = __atomic_load_n(longest, __ATOMIC_RELAXED);
+        while (known < most && !__atomic_compare_exchange_n(longest, &known, most, true, __ATOMIC_RELAXED, __ATOMIC_RELAXED)) {}
+        if (LIST && !FLAT && most > capacity)
+            __atomic_fetch_or(bits, 1, __ATOMIC_RELAXED);
     }
 
     void fill(int* out) const {

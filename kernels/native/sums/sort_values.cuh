@@ -10,14 +10,14 @@ struct SumsArguments {
     const real *radii, *query_radii, *table_of_kinds;
     const int *kinds_of_sources, *kinds_of_queries;
     real *sums, *totals, *errors, *more, *values;
-    int *info, *scratch;
+    int *bits, *scratch;
     int n, m, own, table, closed, drop_self, kinds;
 
     // The arguments of a search that writes nothing but scratch.
     JFRNN_MEMBER SearchArguments of_search() const {
         return {positions, queries, cutoff, excluded_starts, excluded, nullptr, radii, query_radii, table_of_kinds,
-            kinds_of_sources, kinds_of_queries, nullptr, nullptr, nullptr, info, scratch, n, m, own, table, 0, closed, drop_self, 0,
-            kinds};
+            kinds_of_sources, kinds_of_queries, nullptr, nullptr, nullptr, nullptr, bits, scratch, n, m, own, table, 0, closed,
+            drop_self, 0, kinds};
     }
 };
 

@@ -19,7 +19,8 @@ struct CutoffSort : TreeSortArguments {
         Shared& shared = cells.shared;
         shared.next_chunk = shared.next_gathered = shared.next_sorted = shared.gathered = 0;
         shared.unit = shared.cells_for = 0;
-        info[0] = 0;
+        if (longest)
+            *longest = 0;
         if constexpr (BOXES) {  // by cells that are wide enough for the largest cutoff of each system
             cells.build();
             shared.cells_for = 1;
@@ -61,7 +62,7 @@ struct CutoffSort : TreeSortArguments {
         shared.finite_queries = grid.finite;
         if (!own)
             shared.finite_queries = cells.sort(grid, queries, m, cells.query_start, cells.query_ids, false);
-        info[1] = grid.finite < n || shared.finite_queries < m ? 2 : 0;
+        *bits = grid.finite < n || shared.finite_queries < m ? 2 : 0;
         if (n < MANY)
             TreePlaces(*this).put_in_order(0, n);
         return true;

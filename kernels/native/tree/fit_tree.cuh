@@ -3,16 +3,16 @@
 #include "cells.cuh"
 #include "pair_cutoffs.h"
 
-// read: rows of particles [n, ROW], [m, ROW], numbers of the cutoff, cutoffs of sources [n], orders [n], [m]; written: info, scratch
+// read: rows of particles [n, ROW], [m, ROW], numbers of the cutoff, cutoffs of sources [n], orders [n], [m]; written: bits, scratch
 struct FitArguments {
     const real *positions, *queries, *cutoff, *radii;
     const int *source_order, *query_order;
-    int *info, *scratch;
+    int *bits, *scratch;
     int n, m, own, level;
 
     JFRNN_MEMBER SearchArguments of_search() const {
         return {positions, queries, cutoff, nullptr, nullptr, nullptr, radii, nullptr, nullptr, nullptr, nullptr, nullptr, nullptr,
-            nullptr, info, scratch, n, m, own, 0, 0, 0, 0, 0, 0};
+            nullptr, nullptr, bits, scratch, n, m, own, 0, 0, 0, 0, 0, 0};
     }
 };
 
@@ -72,7 +72,7 @@ struct FitTree : Search {
         mine.id = bits_as_real(i);
         sorted[place] = mine;
         if (!finite_point(row)) {
-            atomicOr(&info[1], 2);
+            atomicOr(bits, 2);
             return node;
         }
         if (!is_finite(place + 1))

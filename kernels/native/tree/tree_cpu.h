@@ -166,7 +166,7 @@ struct TreeSort : TreePlaces {
         } else
             shared.finite_queries = sort(queries, m, query_ids);
         sort_by_reach(shared.finite_queries);
-        info[1] = finite < n || shared.finite_queries < m ? 2 : 0;
+        *bits = finite < n || shared.finite_queries < m ? 2 : 0;
         if (n < MANY) {
             put_in_order(0, n);
             make_leaves(0, n);

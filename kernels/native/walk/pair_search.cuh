@@ -36,7 +36,7 @@ struct PairSearch : ImageSearch {
             known.grid = shared.grid;
             known.finite_queries = shared.finite_queries;
             known.longs = LONG && has_long_queries() ? shared.longs : 0;
-            known.longest_before = SUMS ? 0 : *(volatile int*)&info[0];
+            known.longest_before = SUMS ? 0 : *(volatile int*)longest;
         }
         __syncwarp();
         const real off = this->off();

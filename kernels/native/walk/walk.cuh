@@ -89,7 +89,7 @@ struct Walk : PairSearch {
             }
             if (group.size == 0) {
                 if (TREE && lane == 0)
-                    atomicOr(&info[1], 2);
+                    atomicOr(bits, 2);
                 query().none(id_of(load_query(place).id));
                 ++place;
                 continue;

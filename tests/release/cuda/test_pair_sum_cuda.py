@@ -173,7 +173,7 @@ def test_a_box_holds_as_many_particles_as_their_numbers_leave_room_for(monkeypat
     assert _fused.refusal(inputs, "gpu") == "of more than 3 positions in a periodic box on the platform 'gpu'"
 
 
-SPARED = {*EXCLUDED, *TABLE, "radii", "query_radii"}  # what kernels name, and these do not read
+SPARED = {*EXCLUDED, *TABLE, "radii", "query_radii", "longest"}  # what kernels name, and these do not read
 
 
 @pytest.mark.parametrize("periodic", [0, 1])
@@ -189,7 +189,7 @@ def test_programs_for_cuda_call_it_and_plans_have_the_arguments_of_their_kernels
     summing = warp_sums._cuda_callable(kind, plan.text, plan.key).args[0].plan(given, 132)
     assert (len(sorting.steps), len(summing.steps)) == (6, 2 + periodic)
     assert [step.beside for step in summing.steps] == [False] * (1 + periodic) + [bool(periodic)]
-    words = {"info", "scratch"}
+    words = {"bits", "scratch"}
     for found, arrays in ((sorting, {*warp_sums._GIVEN[:3], *words}), (summing, {*given, *words, *SUMS, "values"})):
         for step in found.steps:
             numbers = {**found.numbers, **step.numbers}
@@ -211,7 +211,7 @@ def test_cutoffs_that_differ_compile_and_plans_have_the_arguments_of_their_kerne
         assert f'"jfrnn_box_sums_cuda_3d_f32_scaled_own_dropself_images_skewed_boxes_{rule}_' in text
         assert f'"jfrnn_box_rows_cuda_3d_f32_scaled_own_dropself_list_images_skewed_boxes_{rule}@' in text
         kind = Kind(3, False, scaled=True, own=True, drop_self=True, periodic=4, batched=2, rule=rule)
-        names = (*boxes_warp._GIVEN, "shared_values", "own_values", "columns", *names_of_cutoffs(rule), *SUMS, "info")
+        names = (*boxes_warp._GIVEN, "shared_values", "own_values", "columns", *names_of_cutoffs(rule), *SUMS)
         found = boxes_warp._plan_sums_on_cuda(kind, plan.text, plan.key, {name: (n, 4) for name in names}, 132)
         assert len(found.steps) == 1
     else:
@@ -219,7 +219,7 @@ def test_cutoffs_that_differ_compile_and_plans_have_the_arguments_of_their_kerne
         assert f'"jfrnn_sorting_cuda_3d_f32_scaled_own_{rule}_tree@' in text
         assert f'"jfrnn_pair_sum_cuda_3d_f32_scaled_own_dropself_{rule}_' in text
         kind = Kind(3, False, scaled=True, own=True, drop_self=True, rule=rule, tree=True)
-        names = (*warp_sums._GIVEN, *names_of_tree(rule), *SUMS, "values", "info", "scratch")
+        names = (*warp_sums._GIVEN, *names_of_tree(rule), *SUMS, "values", "bits", "scratch")
         shapes = {name: (n, 4) for name in names}
         found = warp_sums._sorting_callable(kind).args[0].plan(shapes, 132)
         assert [getattr(step, "threads", 0) for step in found.steps] == [0, 0, 64, 32]  # two leaves, and a root

@@ -54,7 +54,8 @@ class OneThread:
         vectors, origin = np.full(3, LENGTH, dtype), np.zeros(3, dtype)
         self.arrays = {
             "now": now, "limit": np.array([half.inside], dtype), "cutoffs": numbers, "vectors": vectors, "origin": origin,
-            "info": np.array([[5, 0]], np.int32), "scratch": np.arange(10_000 + 8 * n, dtype=np.int32), "reference": before.copy(),
+            "longest": np.array([5], np.int32), "bits": np.zeros(1, np.int32), "reference": before.copy(),
+            "scratch": np.arange(10_000 + 8 * n, dtype=np.int32),
             "kept_vectors": vectors.copy(), "kept_origin": origin.copy(), "status": np.zeros(1, np.int32),
             "required": np.array([3], np.int32), "rebuild_count": np.zeros(1, np.int32), "order": np.zeros(n, np.int32),
             "positions": np.zeros((n, dim + 1), dtype), "cutoff": np.full(30, CUTOFF + SKIN, dtype), "stale": np.zeros(1, np.int32),
@@ -72,7 +73,7 @@ class OneThread:
         return kernel._replace(name=name, program=Program(name, text + entry, cuda=False))
 
     def run(self, name):
-        launched.on_cpu(self.kernels[name], **self.arrays, n=len(self.arrays["now"]), blocks=1, answers=1)
+        launched.on_cpu(self.kernels[name], **self.arrays, n=len(self.arrays["now"]), blocks=1)
 
     def is_stale(self, now, before):
         self.arrays |= {"now": np.ascontiguousarray(now[None]), "reference": np.ascontiguousarray(before[None])}
