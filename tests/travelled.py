@@ -73,7 +73,26 @@ def exported(given):
     return given.call(points())
 
 
+def step(x, nbrs):
+    """Renew a list, and sum over it."""
+    nbrs = nbrs.update(x)
+    return nbrs, jfrnn.pair_sum(lambda r, i, j: r @ r, x, None, neighbors=nbrs)
+
+
+def written(folder):
+    """Run a program that takes and returns a list, after bytes of it that look like another version's."""
+    program, nbrs = (folder / "bytes").read_bytes(), pickle.loads((folder / "program").read_bytes())
+    try:
+        jax.export.deserialize(re.sub(rb'\["[0-9a-f]{12}"', b'["0123456789ab"', program))
+    except RuntimeError as error:
+        print(error)
+    nbrs, sums = jax.export.deserialize(program).call(points(), nbrs)
+    return (*jax.tree.leaves(nbrs), sums)
+
+
 def main(way, folder):
+    if way == "written":
+        return written(folder)
     given = pickle.loads((folder / "program").read_bytes())
     if way == "compiled":
         return compiled(given, folder)

@@ -11,7 +11,6 @@ import atexit
 import contextlib
 import ctypes
 import functools
-import hashlib
 import importlib
 import json
 import mmap
@@ -20,7 +19,6 @@ import platform
 import re
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
-from importlib.resources import files
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -30,6 +28,7 @@ from jax import Array
 from jfrnn._engine.ffi import CallFrame
 from jfrnn._engine.plans import MOST_WORDS, Desk, LaidPlan, Plan, begin_programs, lay_plan, multiprocessors_of, open_desk
 from jfrnn._engine.start import alone, apart, compiler, finish, wait_for, warn_of_folders
+from jfrnn._tracing import check_version, decode, encode, name_of_version
 from jfrnn.kernels import Program, one_at_a_time
 
 TARGET = "jfrnn"  # what programs call; jax.export wants to be told that it stays
@@ -70,7 +69,7 @@ def kernel(make: Callable[..., Call]) -> Callable[..., Callable[..., Any]]:
     @functools.wraps(make)
     def made(*arguments: Static) -> Callable[..., Any]:
         found = make(*arguments)
-        return functools.partial(_call, found, json.dumps([place, _encode(arguments)]))
+        return functools.partial(_call, found, json.dumps([place, encode(arguments)]))
 
     _calls[place] = make
     return functools.lru_cache(_MOST)(made)
@@ -88,7 +87,7 @@ def _call(found: Call, recipe: str, *inputs: Array, output_dims: dict[str, Any])
         more = {"manual_axis_type": kind, "sharding": jax.sharding.NamedSharding(mesh, everywhere)}
     results = [jax.ShapeDtypeStruct(shape, dtype, **more) for shape, dtype in zip(written, found.results.values(), strict=True)]
     shapes = "_".join("x".join(map(str, shape)) for shape in (*(x.shape for x in inputs), *written))
-    name = f"{found.name}@{_sources()}@{shapes}"
+    name = f"{found.name}@{name_of_version()}@{shapes}"
     names = list(found.inputs), list(found.results)
     aliases = {names[0].index(given): names[1].index(result) for result, given in found.instead.items()}
     call = jax.ffi.ffi_call(TARGET, results, vmap_method="sequential", input_output_aliases=aliases)
@@ -98,39 +97,6 @@ def _call(found: Call, recipe: str, *inputs: Array, output_dims: dict[str, Any])
 # --- what a program carries -------------------------------------------------------------------------------------------
 
 
-def _encode(value: Static) -> Static:
-    if not isinstance(value, tuple):
-        return value
-    parts = [_encode(part) for part in value]
-    return {f"{type(value).__module__}.{type(value).__name__}": parts} if hasattr(value, "_fields") else parts
-
-
-def _decode(value: Static) -> Static:
-    if isinstance(value, list):
-        return tuple(_decode(part) for part in value)
-    if not isinstance(value, dict):
-        return value
-    ((name, parts),) = value.items()
-    module, _, kind = name.rpartition(".")
-    if not module.startswith("jfrnn."):
-        raise ValueError(f"no type of the library: {name}")
-    return getattr(importlib.import_module(module), kind)(*map(_decode, parts))
-
-
-@functools.cache
-def _sources() -> str:
-    """Return a name of the sources that decide what a kernel is given, so that it is never given what was made for another."""
-    found = hashlib.sha256()
-    for package, others in (("jfrnn", ("cases", "kernels", "sph")), ("jfrnn.kernels", ())):
-        root = str(files(package))
-        for folder, inner, names in os.walk(root):
-            inner[:] = sorted(name for name in inner if folder != root or name not in others)
-            for name in sorted(names):
-                if name.endswith((".py", ".h", ".cuh")):
-                    found.update(Path(folder, name).read_bytes())
-    return found.hexdigest()[:12]
-
-
 def _read_call(name: str, recipe: str) -> tuple[Call, Shapes]:
     """Return what a program calls, and with which shapes.
 
@@ -138,13 +104,12 @@ def _read_call(name: str, recipe: str) -> tuple[Call, Shapes]:
         RuntimeError: Another version of the library made the program.
     """
     _, sources, shapes = name.split("@")
-    if sources != _sources():
-        raise RuntimeError("this program was made with another version of jfrnn. Export or compile it again with this one.")
+    check_version(sources)
     place, arguments = json.loads(recipe)
     module = place.rpartition(".")[0]
     if place not in _calls and module.startswith("jfrnn."):
         importlib.import_module(module)
-    found = _calls[place](*_decode(arguments))
+    found = _calls[place](*decode(arguments))
     numbers = [tuple(map(int, filter(None, shape.split("x")))) for shape in shapes.split("_")]
     return found, dict(zip([*found.inputs, *found.results], numbers, strict=True))
 

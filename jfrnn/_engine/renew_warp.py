@@ -30,7 +30,7 @@ from jfrnn._geometry import (
     make_lattice,
     sides_of,
 )
-from jfrnn._tracing import compile_program
+from jfrnn._tracing import compile_program, portable
 from jfrnn.kernels import Kind, cells_cuda, few_cuda, renew
 
 _BITS = {"NOT_FINITE": Status.NONFINITE, "OUT_OF_RANGE": Status.OUT_OF_RANGE, "BOX_TOO_SMALL": Status.BOX_TOO_SMALL}
@@ -59,6 +59,7 @@ class KeptRows(NamedTuple):
     order: Array | None
 
 
+@portable
 class BoxNumbers(NamedTuple):
     """What kernels are told of the box of a list, computed once: on a GPU, XLA moves nothing out of a loop.
 

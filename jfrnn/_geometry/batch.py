@@ -6,7 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
+from jfrnn._tracing import portable
 
+
+@portable
 class Batch(NamedTuple):
     """The system number of each particle; only particles of one system can be neighbors. A pytree.
 

@@ -11,13 +11,14 @@ import numpy as np
 from jax.core import Tracer
 
 from jfrnn._geometry.reduced import count_cells, short_vectors
-from jfrnn._tracing import Given, as_array, as_dtype, own_transfers
+from jfrnn._tracing import Given, as_array, as_dtype, own_transfers, portable
 
 _FLAT, _FLAT_ULPS = 1e-12, 16  # the square of a height beside edges of length 1, also in units of eps, that rounding leaves of none
 _SINGULAR = 1e-9  # determinants below may be those of dependent rows
 Numbers = Any  # an array of NumPy or JAX, concrete or traced
 
 
+@portable
 @jax.tree_util.register_pytree_with_keys_class
 @dataclasses.dataclass(frozen=True, init=False)
 class Box:

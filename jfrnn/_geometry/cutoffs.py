@@ -10,6 +10,7 @@ import numpy as np
 from jax import Array, lax
 
 from jfrnn._geometry.floats import two_sum, unit_scale
+from jfrnn._tracing import portable
 
 Flags = Any  # bool array of NumPy or JAX, like the argument
 RULES = ("gather", "scatter", "either", "both", "mean")  # cutoff of a pair: i's, j's, larger, smaller, mean
@@ -63,6 +64,7 @@ class Cutoff:
     scaled: bool = dataclasses.field(metadata={"static": True})
 
 
+@portable
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Radii:

@@ -15,11 +15,12 @@ from jax.core import Tracer
 
 from jfrnn._geometry.lattice import Lattice, adjugate
 from jfrnn._geometry.wrapping import Wrapped, unpack_turns
-from jfrnn._tracing import Given, IndexRows, as_array, gather, on_device, own_transfers
+from jfrnn._tracing import Given, IndexRows, as_array, gather, on_device, own_transfers, portable
 
 _ArrayModule = Any  # numpy or jax.numpy
 
 
+@portable
 class Exclusions(NamedTuple):
     """The sources that each row of a search excludes, in all of their periodic images or in one. A pytree.
 
@@ -39,6 +40,7 @@ class Exclusions(NamedTuple):
         return self if self.turned is None else self._replace(rows=self.turned, turned=self.rows)
 
 
+@portable
 class ExcludedRows(NamedTuple):
     """Rows of excluded sources, one for each query. A pytree.
 

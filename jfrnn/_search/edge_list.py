@@ -14,7 +14,7 @@ from jfrnn._search.edges import Edges, Graph, close_edges, edges_of, edges_of_ro
 from jfrnn._search.exports import MOST_PAIRS
 from jfrnn._search.kept_search import KeptSearch
 from jfrnn._search.present import Present, Topology, one_each
-from jfrnn._tracing import Points, Real, at_once, own_transfers
+from jfrnn._tracing import Points, Real, at_once, own_transfers, portable
 
 _TOTAL_STEP = 16  # steps between powers of two, in which totals are rounded up
 
@@ -42,6 +42,7 @@ def count_total(inputs: Inputs, options: Options, slack: Real) -> int:
     return round_total(math.ceil(pairs * slack))
 
 
+@portable
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class EdgeList(KeptSearch):

@@ -14,9 +14,10 @@ from jfrnn._search.exports import flat_pairs
 from jfrnn._search.geometry import edge_shifts, ends_of, lattice_of_rows, norms
 from jfrnn._search.present import Present, Reverse, Topology, one_each
 from jfrnn._search.triplets import Triplets, triplets_of
-from jfrnn._tracing import call_apart, compile_program, on_platform
+from jfrnn._tracing import call_apart, compile_program, on_platform, portable
 
 
+@portable
 class Edges(NamedTuple):
     """Edges from neighbors j to particles i, sorted by i; a pytree. Edges beyond the last pair lead from n to m.
 
@@ -62,6 +63,7 @@ class Edges(NamedTuple):
         return triplets_of(self.receivers, self.mask, known, total, half)
 
 
+@portable
 class Graph(NamedTuple):
     """A graph in the form of jraph's `GraphsTuple`: the same fields in the same order, which its models read and replace.
 

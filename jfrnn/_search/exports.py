@@ -11,11 +11,12 @@ from jax.core import Tracer
 
 from jfrnn._engine import add_up
 from jfrnn._geometry import Status
-from jfrnn._tracing import compile_program
+from jfrnn._tracing import compile_program, portable
 
 MOST_PAIRS = 2**31 - 1  # most pairs that int32 offsets can number
 
 
+@portable
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class DenseNeighbors:

@@ -18,7 +18,7 @@ from jfrnn._search.geometry import lattice_shifts, norms, vectors_of
 from jfrnn._search.kept_search import KeptSearch
 from jfrnn._search.present import MOST_SLOTS, Present, Topology, make_topology
 from jfrnn._search.problem import count_capacity, round_capacity
-from jfrnn._tracing import Points, Size, at_once, call_apart, own_transfers
+from jfrnn._tracing import Points, Size, at_once, call_apart, own_transfers, portable
 
 _FEW_SLOTS = 1 << 18  # up to which a program takes longer to compile than its displacements to compute
 
@@ -31,6 +31,7 @@ class Now(TypedDict, total=False):
     box: Box | None
 
 
+@portable
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class NeighborList(KeptSearch):

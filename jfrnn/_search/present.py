@@ -16,12 +16,13 @@ from jax import Array, lax
 
 from jfrnn._engine import Options, reverse_slots, slots_by_source
 from jfrnn._geometry import EXCHANGED, Batch, Box, Cutoff, Cutoffs, Images, Radii, make_cutoffs
-from jfrnn._tracing import on_platform
+from jfrnn._tracing import on_platform, portable
 
 MOST_SLOTS = 2**31 - 1  # that int32 can number
 _BLOCK = 1 << 22  # ids that are compared at a time by array programming: 16 MB
 
 
+@portable
 class Reverse(NamedTuple):
     """The slots of each source.
 
@@ -156,6 +157,7 @@ def make_topology(
     return Topology(idx, codes, reverse, order, sources, images, mutual, options.engine.native)
 
 
+@portable
 class ImageCodes(NamedTuple):
     """The periodic image that each slot refers to, for lists with more than the minimum image.
 

@@ -11,9 +11,10 @@ from jax.core import Tracer
 
 from jfrnn._engine import add_up
 from jfrnn._search.exports import check_held, check_total
-from jfrnn._tracing import compile_program
+from jfrnn._tracing import compile_program, portable
 
 
+@portable
 class Triplets(NamedTuple):
     """Two different edges j → i and k → i of each triplet (j, i, k), sorted by the first; a pytree.
 

@@ -14,8 +14,10 @@ from jax import Array, lax
 
 from jfrnn import _geometry as geometry
 from jfrnn._search.geometry import find_ends
+from jfrnn._tracing import portable
 
 
+@portable
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Verlet:

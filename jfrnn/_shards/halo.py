@@ -29,11 +29,12 @@ from jax.sharding import Mesh
 from jfrnn._geometry import Status, are_finite
 from jfrnn._search import MOST_PAIRS, saturating_add
 from jfrnn._shards.particles import Particles, Required, of_all_shards, of_shards, share_bits, share_largest
-from jfrnn._tracing import Packed, pack_parts, packed_places
+from jfrnn._tracing import Packed, pack_parts, packed_places, portable
 
 _SIDE_BY_SIDE = 32  # rows of particles that a GPU reduces beside each other; shards have room for a multiple of as many
 
 
+@portable
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Halo:

@@ -15,10 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 from jax.core import Tracer
-from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from jfrnn._geometry import Box, Status, check_again, check_slack, check_values, names_of_bits, shape_of
-from jfrnn._tracing import Given, Tree
+from jfrnn._tracing import Given, Tree, mesh_of_parts, parts_of_mesh, portable
 
 OVERFLOWS = Status.ROW_OVERFLOW | Status.SHARD_OVERFLOW | Status.HALO_OVERFLOW | Status.HALO_TOO_FAR
 
@@ -37,6 +37,7 @@ class Sizes(NamedTuple):
     hops: tuple[int, ...]
 
 
+@portable
 class Required(NamedTuple):
     """The buffer sizes that would have sufficed for everything so far; int32, equal on all devices.
 
@@ -71,6 +72,7 @@ class Met(Protocol):
         ...
 
 
+@portable
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Particles:
@@ -174,25 +176,16 @@ class Particles:
     def __reduce__(self) -> tuple[Any, ...]:
         """Return how to unpickle the particles on devices of the same numbers; a mesh itself cannot be pickled."""
         fields = {field.name: getattr(self, field.name) for field in dataclasses.fields(self) if field.name != "mesh"}
-        mesh = self.mesh
-        return _spread_again, (fields, [d.id for d in mesh.devices.flat], mesh.devices.shape, mesh.axis_names, mesh.axis_types)
+        return _spread_again, (fields, parts_of_mesh(self.mesh))
 
 
-def _spread_again(
-    fields: dict[str, Any], ids: list[int], shape: tuple[int, ...], names: tuple[str, ...], kinds: tuple[AxisType, ...]
-) -> Particles:
+def _spread_again(fields: dict[str, Any], parts: tuple[Any, ...]) -> Particles:
     """Make particles from the fields of others, on devices of the same numbers.
 
     Raises:
         RuntimeError: this process has no such devices.
     """
-    devices = {device.id: device for device in jax.devices()}
-    if missing := [k for k in ids if k not in devices]:
-        raise RuntimeError(
-            f"particles were spread over devices {ids}, of which this process lacks {missing}: collect() them before they travel, "
-            "and scatter() them anew."
-        )
-    mesh = Mesh(np.array([devices[k] for k in ids]).reshape(shape), names, axis_types=kinds)
+    mesh = mesh_of_parts(*parts)
     particles = Particles(**fields, mesh=mesh)
     places = jax.tree.map(
         lambda spec: NamedSharding(mesh, spec), spec_of(particles), is_leaf=lambda x: isinstance(x, PartitionSpec)

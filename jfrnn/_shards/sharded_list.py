@@ -19,8 +19,10 @@ from jfrnn._shards.halo import Halo, halo_in_shard, halo_spec
 from jfrnn._shards.migrate import migrate
 from jfrnn._shards.particles import OVERFLOWS, Particles, Required, check, check_particles, of_shards, share_bits, share_largest
 from jfrnn._shards.scatter import fetch
+from jfrnn._tracing import portable
 
 
+@portable
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Neighbors:

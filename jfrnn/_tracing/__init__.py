@@ -38,5 +38,6 @@ from jfrnn._tracing.late import (
     varying_axes,
     without_mesh,
 )
+from jfrnn._tracing.portable import check_version, decode, encode, mesh_of_parts, name_of_version, parts_of_mesh, portable
 from jfrnn._tracing.programs import compile_program
 from jfrnn._tracing.ruled import ruled, still

@@ -20,6 +20,7 @@ import numpy as np
 from jax import Array, lax
 
 from jfrnn._geometry import Cutoff
+from jfrnn._tracing import portable
 from jfrnn._triangles.exact import Vector, cross, dot, minus, sum_of
 
 MOST_CELLS = {2: 8, 3: 16}  # most cells per triangle, by dimension
@@ -30,6 +31,7 @@ _BUCKETS_PER_TRIANGLE = 8
 _FEWEST_BUCKETS = 1024
 
 
+@portable
 class TriangleCells(NamedTuple):
     """Triangles sorted by the hash bucket of their cells. A pytree.
 

@@ -16,11 +16,13 @@ import numpy as np
 from jax import Array
 
 from jfrnn._geometry import Cutoff, hilbert_order
+from jfrnn._tracing import portable
 
 WIDTH = 16  # children of a node
 _CELL = 2.0**-20  # cell of the curve, relative to the extent of all box centers
 
 
+@portable
 class TriangleTree(NamedTuple):
     """Triangles in a tree of boxes. A pytree.
 

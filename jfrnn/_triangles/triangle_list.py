@@ -13,7 +13,7 @@ from jax.core import Tracer
 
 from jfrnn import _geometry as geometry
 from jfrnn._search import norms, round_capacity
-from jfrnn._tracing import IndexRows, Points, Real, as_array, call_apart, compile_program, own_transfers
+from jfrnn._tracing import IndexRows, Points, Real, as_array, call_apart, compile_program, own_transfers, portable
 from jfrnn._triangles.cells import TriangleCells, gather_corners
 from jfrnn._triangles.closest import are_contacts, nearest_of, pseudonormals
 from jfrnn._triangles.crossings import are_crossed
@@ -23,6 +23,7 @@ from jfrnn._triangles.tree import TriangleTree, grow_tree
 from jfrnn._triangles.winding import is_closed, least_winding, ray_ways
 
 
+@portable
 class SignedDistance(NamedTuple):
     """Distances to a closed wall, negative inside.
 
@@ -41,6 +42,7 @@ class SignedDistance(NamedTuple):
     watertight: Array
 
 
+@portable
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class TriangleList:

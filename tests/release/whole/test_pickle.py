@@ -1,4 +1,4 @@
-"""What is public travels: through pickle, deepcopy and a process pool."""
+"""What is public travels: through pickle, deepcopy, a process pool, and as argument of exported programs."""
 
 import copy
 import functools
@@ -48,6 +48,12 @@ def examples():
     ]
 
 
+def of_edges():
+    """Return what lists give of edges."""
+    edges = examples()[2].edges(X)
+    return edges, edges.triplets(), examples()[2].to_jraph(X)
+
+
 def assert_same(one, other):
     assert type(one) is type(other)
     assert str(one) == str(other)
@@ -63,6 +69,20 @@ def assert_same(one, other):
 def test_every_public_object_survives(travel):
     for example in examples():
         assert_same(travel(example), example)
+
+
+def test_programs_that_are_written_to_bytes_take_and_return_every_public_pytree():
+    trees = [example for example in examples() if all(isinstance(x, jax.Array | np.ndarray) for x in jax.tree.leaves(example))]
+    assert len(trees) >= len(examples()) - 4  # plans, errors, bits and sizes are no arrays
+    for example in [*trees, *of_edges()]:
+        check_written(example)
+
+
+def check_written(example):
+    written = jax.export.export(jax.jit(lambda x: x))(example).serialize()
+    again = jax.export.deserialize(written)
+    assert (again.in_tree, again.out_tree) == (jax.tree.structure(((example,), {})), jax.tree.structure(example))
+    assert_same(again.call(example), jax.jit(lambda x: x)(example))
 
 
 def test_every_public_class_has_an_example():

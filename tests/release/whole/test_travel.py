@@ -64,6 +64,17 @@ def test_what_was_exported_runs_elsewhere_with_the_same_version(tmp_path):
     assert "made with another version of jfrnn. Export or compile it again with this one." in told
 
 
+def test_programs_with_lists_are_written_to_bytes_and_run_elsewhere_with_the_same_version(tmp_path):
+    x, box = travelled.points(), jfrnn.Box([[1.0, 0.0], [0.3, 1.0]])
+    nbrs = jfrnn.search(x, 0.2, skin=0.02, box=box, batch=np.arange(40) % 2, reverse=True, exclude=[[0, 1]])
+    program = jax.export.export(jax.jit(travelled.step), disabled_checks=SAFE)(x, nbrs)
+    (tmp_path / "bytes").write_bytes(program.serialize())
+    (tmp_path / "program").write_bytes(pickle.dumps(nbrs))
+    renewed, sums = travelled.step(x, nbrs)
+    told = run_elsewhere("written", tmp_path, (*jax.tree.leaves(renewed), sums))
+    assert "made with another version of jfrnn. Export or compile it again with this one." in told
+
+
 @pytest.mark.parametrize("lower", ["cpu", "cuda"])
 def test_programs_are_exported_for_any_platform(lower):
     both = jax.jit(lambda x: (*travelled.counted(x), jfrnn.count(x, 0.25, backend="hashgrid")))
