@@ -111,6 +111,8 @@ def tell(x: Given, how: Callable[[np.ndarray], object]) -> str:
         return "deleted"
     if isinstance(x, Array) and not (x.is_fully_addressable or x.is_fully_replicated):
         return "elsewhere"
+    if x.dtype.kind not in "biu":  # of a tree like a list, as JAX's derivatives in one are
+        return "float0" if x.dtype == jax.dtypes.float0 else str(x.dtype)
     return str(how(jax.device_get(x)))
 
 

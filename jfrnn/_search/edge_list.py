@@ -79,7 +79,8 @@ class EdgeList(KeptSearch):
         """Summarize the list in a line; waits for the device."""
         *batch, total = shape_of(self.senders, axes=1)
         ends = shape_of(self.offsets, axes=1)[-1]
-        pairs, bits = tell(self.offsets, lambda offsets: offsets[..., -1].sum(dtype=np.int64)), names_of_bits(self.status)
+        pairs = tell(self.offsets, lambda offsets: np.atleast_1d(offsets)[..., -1:].sum(dtype=np.int64))
+        bits = names_of_bits(self.status)
         return self._describe(batch, ends and ends - 1, f"total {total}", f"{pairs} pairs, status {bits}")
 
     @property

@@ -163,6 +163,9 @@ def test_a_list_is_printed_in_a_line():
     jax.eval_shape(lambda nbrs: seen.append(repr(nbrs)), nbrs)
     assert seen == [line.format("traced", "traced")]
     assert "shape" not in repr(jax.tree.map(lambda _: 0, nbrs))  # whatever stands where arrays stood
+    slopes = jax.grad(lambda nbrs: nbrs.distances(x)[0].sum(), allow_int=True)(nbrs)
+    assert repr(slopes) == line.format("float0", "float0")
+    assert repr(jax.tree.map(lambda x: x.astype(jnp.float32), nbrs)) == line.format("float32", "float32")
 
 
 def test_boxes_and_totals_are_taken_by_place_and_by_name():

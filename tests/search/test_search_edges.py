@@ -227,6 +227,8 @@ def test_a_line_says_what_the_list_is():
     many = jax.vmap(lambda x: jfrnn.search_edges(x, 1.0, total=8, backend="warp"))(x[None])
     assert repr(many) == "EdgeList(batch of [1], 5 particles, total 8, cutoff 1, engine 'warp', 20 pairs, status TOTAL_OVERFLOW)"
     assert "total None" in repr(jax.tree.map(lambda _: None, one))  # whatever stands where arrays stood
+    assert "total None" in repr(jax.tree.map(jnp.sum, one))
+    assert "float32 pairs, status float32" in repr(jax.tree.map(lambda x: x.astype(jnp.float32), one))
 
 
 def test_where_rows_begin_never_wraps():
