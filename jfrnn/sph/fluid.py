@@ -15,7 +15,7 @@ from jfrnn.sph.errors import SceneError
 from jfrnn.sph.forces import density_and_pressure
 from jfrnn.sph.kernels import KERNELS
 from jfrnn.sph.pairs import Neighbors, reach
-from jfrnn.sph.particles import Force, Model, State, active, wrapped
+from jfrnn.sph.particles import Force, Model, State, active, box_of, wrapped
 
 __all__ = ["begin", "beside", "courant", "density_and_pressure", "energies", "list_neighbors", "make_model", "make_state", "step"]
 
@@ -36,12 +36,11 @@ def make_model(scene: FluidScene, dtype: type, backend: str, force: Force | None
     _check_parts(scene)
     gravity = None if scene.physics.gravity is None else np.asarray(scene.physics.gravity)
     physics = jax.tree.map(array, replace(scene.physics, gravity=gravity))
-    box = scene.periodic and jfrnn.Box(array(scene.periodic.lengths), scene.periodic.axes, array(scene.periodic.lower))
     return Model(
         physics=physics,
         m=array(scene.masses),
         wall=None if scene.wall is None else jnp.asarray(scene.wall),
-        box=box,
+        box=box_of(scene, dtype),
         tank=scene.tank and (array(scene.tank.lower), array(scene.tank.upper)),
         enters=None if scene.enters is None else array(scene.enters),
         step=None if scene.step is None else array(scene.step),
@@ -56,7 +55,7 @@ def make_model(scene: FluidScene, dtype: type, backend: str, force: Force | None
 
 
 def _check_box(scene: FluidScene) -> None:
-    """Refuse a periodic box in which a particle might meet two images of another: the solver traces its box."""
+    """Refuse a periodic box in which a particle might meet two images of another, or of the solid: the solver traces its box."""
     if scene.periodic is None:
         return
     least = 2.05 * reach(KERNELS[scene.physics.kernel], scene.physics.smoothing)
@@ -65,6 +64,8 @@ def _check_box(scene: FluidScene) -> None:
             raise SceneError(
                 f"periodic box must be 2.05 cutoffs wide along {axis}: {least:.6g} m, got {length:.6g} m: take more particles."
             )
+    if scene.solid is not None:
+        solids.check_images(scene)
 
 
 def _check_parts(scene: FluidScene) -> None:

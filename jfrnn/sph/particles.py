@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field, fields
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +11,7 @@ from jax import Array
 
 import jfrnn
 from jfrnn.cases import fluids
-from jfrnn.cases.fluids import Gas, Physics, Turning
+from jfrnn.cases.fluids import Gas, Physics, Scene, Turning
 from jfrnn.sph.errors import SceneError
 from jfrnn.sph.kernels import KERNELS, Kernel
 from jfrnn.sph.pairs import reach
@@ -197,14 +197,23 @@ def active(model: Flow, s: State) -> Array | None:
     return ~s.gone if entered is None else entered & ~s.gone
 
 
+def box_of(scene: Scene, dtype: Any) -> jfrnn.Box | None:  # noqa: ANN401
+    """Return the periodic box of a scene, numbers of a dtype; None where space is open."""
+    box = scene.periodic
+    return box and jfrnn.Box(jnp.asarray(box.lengths, dtype), box.axes, jnp.asarray(box.lower, dtype))
+
+
+def periods_from(box: jfrnn.Box, x: Array, about: Array | None = None) -> Array:
+    """Return how far positions [n, d] are from their images in a box [m], shape [n, d], or from those nearest to a point [d]."""
+    low = box.origin if about is None else about - box.vectors / 2
+    turns = jnp.floor((x - low) / box.vectors)
+    return jnp.where(jnp.asarray(box.periodic), turns * box.vectors, 0)
+
+
 def wrapped(model: Flow, x: Array, about: Array | None = None) -> Array:
     """Return positions [n, d] in the periodic box, where there is one; or of their images those that are nearest to a point [d]."""
     box = getattr(model, "box", None)  # a gas has none
-    if box is None:
-        return x
-    low = box.origin if about is None else about - box.vectors / 2
-    turns = jnp.floor((x - low) / box.vectors)
-    return jnp.where(jnp.asarray(box.periodic), x - turns * box.vectors, x)
+    return x if box is None else x - periods_from(box, x, about)
 
 
 def mass_there(model: Flow, s: State) -> Array:

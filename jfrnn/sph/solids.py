@@ -9,10 +9,13 @@ ends at one. The step is shorter than half the cutoff, or is not taken. So where
 is between its ends; and where one is, the signed distance of the end tells its side, by a theorem for closed meshes. A particle
 that ends nearer than a gap is put one gap away; one that after that is not outside by half a gap stays where it was, and moves with
 the wall. Rounding is many orders smaller than the gap.
+
+In a periodic box the wall has images, of which no particle sees two: `check_images` refuses others. Triangles are where the scene
+has them, and particles are looked at as their images nearest to the wall.
 """
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -27,7 +30,7 @@ from jfrnn.sph.errors import SceneError
 from jfrnn.sph.inside import find_inside
 from jfrnn.sph.kernels import KERNELS, Kernel
 from jfrnn.sph.pairs import reach
-from jfrnn.sph.particles import Beside, Model, State, active
+from jfrnn.sph.particles import Beside, Model, State, active, box_of, periods_from
 from jfrnn.sph.viscosity import kinematic
 
 GAP = 0.2  # particle spacings: on a lattice, particles at a wall are half a spacing away
@@ -48,7 +51,7 @@ def begin(scene: FluidScene, x: Array, angle: Array | None = None) -> Beside | N
     vertices, faces, cutoff = jnp.asarray(solid.vertices, x.dtype), jnp.asarray(solid.faces), _reach(scene)
     turning, goes_on = turning_of(scene, x.dtype), angle is not None
     angle = jnp.zeros((), x.dtype) if turning is not None and angle is None else angle
-    at = into_frame(x, turning, angle)
+    at = into_frame(_images(box_of(scene, x.dtype), x, vertices, turning), turning, angle)
     tri = jfrnn.search_triangles(at, vertices, faces, cutoff)
     signed = tri.signed_distance(at)
     if not signed.watertight:
@@ -87,8 +90,9 @@ def check_far(scene: FluidScene, x: Array, seen: Beside | None) -> None:
     if seen is None or scene.solid is None:
         return
     far, corners = ~np.asarray(seen.mask), np.asarray(scene.solid.vertices, np.float64)[scene.solid.faces]
-    inside = np.zeros(scene.n, bool)
-    inside[far] = find_inside(np.asarray(x, np.float64)[far], _reach(scene), corners)
+    inside, turning = np.zeros(scene.n, bool), turning_of(scene, x.dtype)
+    at = _images(box_of(scene, x.dtype), x, seen.tri.vertices, turning)
+    inside[far] = find_inside(np.asarray(at, np.float64)[far], _reach(scene), corners)
     _refuse(scene, inside)
 
 
@@ -114,8 +118,9 @@ def hidden(model: Model, s: State, beside: Beside, points: Array) -> tuple[Array
     """
     count, (n, dim) = len(points), s.x.shape
     room = math.ceil(_ROOM_AROUND * count * _neighbors(model.spacing, model.cutoff, dim))
-    edges = jfrnn.search_edges(s.x, model.cutoff, queries=points, active=active(model, s), total=min(room, count * n))
-    at, seen = (into_frame(x, model.turning, beside.angle) for x in (s.x, points))
+    x, points = (_images(model.box, each, beside.tri.vertices, model.turning) for each in (s.x, points))
+    edges = jfrnn.search_edges(x, model.cutoff, queries=points, active=active(model, s), total=min(room, count * n))
+    at, seen = (into_frame(each, model.turning, beside.angle) for each in (x, points))
     tri, rows = beside.tri, jnp.concatenate([at, jnp.broadcast_to(at[:1], seen.shape)])
     around = jfrnn.search_triangles(rows, tri.vertices, tri.faces, tri.cutoff, capacity=tri.capacity)  # rows of particles are read
     asked = jnp.stack([edges.senders, n + edges.receivers], axis=1)
@@ -127,7 +132,8 @@ def hidden(model: Model, s: State, beside: Beside, points: Array) -> tuple[Array
 def grow(model: Model, s: State, after: Beside) -> State:
     """Return a state that sees the wall with more room: with what turned out to be needed until `after`."""
     assert s.solid is not None, "there is a wall"
-    at = into_frame(s.x, model.turning, s.solid.angle)
+    x = _images(model.box, s.x, s.solid.tri.vertices, model.turning)
+    at = into_frame(x, model.turning, s.solid.angle)
     seen = s.solid._replace(tri=after.tri.grow(at) if after.tri.overflow else s.solid.tri)
     if after.sight is not None and after.sight.overflow:
         neighbors = _neighbors(model.spacing, model.cutoff, s.x.shape[1])
@@ -146,6 +152,47 @@ def turning_of(scene: Scene, dtype: np.dtype | type) -> Turning[Array, Array] | 
         return None
     axis = None if turning.axis is None else jnp.asarray(turning.axis, dtype) / np.linalg.norm(turning.axis)
     return fluids.Turning(jnp.asarray(turning.center, dtype), axis, jnp.asarray(turning.rate, dtype))
+
+
+def check_images(scene: FluidScene) -> None:
+    """Refuse a periodic box in which a particle might be within reach of two images of the solid, however that has turned."""
+    solid, box, reach_of = scene.solid, scene.periodic, _reach(scene)
+    if solid is None or box is None:
+        return
+    r = np.asarray(solid.vertices, np.float64) - np.asarray(_middle(np.asarray(solid.vertices), solid.turning))
+    if solid.turning is None:
+        farthest = np.abs(r).max(axis=0)
+    else:
+        axis = np.zeros(scene.dim) if solid.turning.axis is None else solid.turning.axis / np.linalg.norm(solid.turning.axis)
+        along = r @ axis
+        around = np.linalg.norm(r - along[:, None] * axis, axis=1)
+        farthest = (np.abs(along[:, None] * axis) + around[:, None] * np.sqrt(np.maximum(1 - axis**2, 0))).max(axis=0)
+    for k, name in enumerate("xyz"[: scene.dim]):
+        least = 2 * (float(farthest[k]) + reach_of)
+        if box.axes[k] and box.lengths[k] < least:
+            raise SceneError(
+                f"periodic box must be {least:.6g} m wide along {name} beside this solid, so that no particle is within reach of "
+                f"two images of it, got {box.lengths[k]:.6g} m: take a larger box, or walls of dummies."
+            )
+
+
+def _middle(vertices: Any, turning: Turning[Any, Any] | None) -> Any:  # noqa: ANN401
+    """Return the point about which a solid lies, shape [d]: what it turns around, or the middle of its corners."""
+    return (vertices.min(axis=0) + vertices.max(axis=0)) / 2 if turning is None else turning.center
+
+
+def _periods(box: jfrnn.Box | None, x: Array, vertices: Array, turning: Turning[Array, Array] | None) -> Array | None:
+    """Return how far positions [n, d] are from their images nearest to a solid [m], shape [n, d]; None in open space."""
+    return None if box is None else periods_from(box, x, _middle(vertices, turning))
+
+
+def _images(box: jfrnn.Box | None, x: Array, vertices: Array, turning: Turning[Array, Array] | None) -> Array:
+    """Return of positions [n, d] in a periodic box the images nearest to a solid [m]; in open space the positions."""
+    return _less(x, _periods(box, x, vertices, turning))
+
+
+def _less(x: Array, periods: Array | None) -> Array:
+    return x if periods is None else x - periods
 
 
 def into_frame(x: Array, turning: Turning[Array, Array] | None, angle: Array | None) -> Array:
@@ -183,7 +230,8 @@ def keep_out(model: Model, s: State, x: Array, v: Array, dt: Array, rests: Array
         return s._replace(x=x, v=v)
     old, gap, turning = s.solid, GAP * model.spacing, model.turning
     angle = None if turning is None or old.angle is None else old.angle + dt * turning.rate
-    before, ends = into_frame(s.x, turning, old.angle), into_frame(x, turning, angle)
+    periods = _periods(model.box, x, old.tri.vertices, turning)
+    before, ends = into_frame(_less(s.x, periods), turning, old.angle), into_frame(_less(x, periods), turning, angle)
     tri = old.tri.update(ends)
 
     def look(points: Array, _: None) -> tuple[Array, tuple[Array, Array, Array]]:
@@ -200,10 +248,11 @@ def keep_out(model: Model, s: State, x: Array, v: Array, dt: Array, rests: Array
     if rests is not None:
         meets, stays = meets & ~rests, stays & ~rests
     kept = _leave_frame(jnp.where(stays[:, None], before, placed), turning, angle)
+    kept = kept if periods is None else kept + periods
     x = jnp.where((meets | stays)[:, None], kept, x)
     wall, normal = jnp.zeros_like(v), _turn(normal, turning, angle)
     if turning is not None:
-        wall = turning.rate * _across(x - turning.center, turning)
+        wall = turning.rate * _across(_less(x, periods) - turning.center, turning)
     toward = jnp.minimum(jnp.sum((v - wall) * normal, axis=1), 0)
     v = jnp.where(meets[:, None], v - toward[:, None] * normal, v)
     v = jnp.where(stays[:, None], wall, v)
@@ -263,7 +312,8 @@ def _find_acting(model: Model, s: State, beside: Beside) -> _Acting:
     normal, turning = _turn(beside.normal, model.turning, beside.angle), model.turning
     if turning is None:
         return _Acting(area, weight, distance, normal, s.v, None)
-    velocity = turning.rate * _across(s.x - distance[:, None] * normal - turning.center, turning)
+    x = _images(model.box, s.x, beside.tri.vertices, turning)
+    velocity = turning.rate * _across(x - distance[:, None] * normal - turning.center, turning)
     return _Acting(area, weight, distance, normal, s.v - velocity, turning.rate * _across(velocity, turning))
 
 
@@ -307,7 +357,8 @@ def load(model: Model, s: State, beside: Beside, rho: Array, p: Array) -> tuple[
     if model.turning is not None and physics.viscosity is not None and not physics.slip:
         spin = model.turning.rate * _across(wall.normal, model.turning)
         onto = onto - (2 * kinematic(physics.viscosity_form, physics.viscosity, rho) * wall.area)[:, None] * spin
-    return onto, s.x - wall.distance[:, None] * wall.normal
+    x = _images(model.box, s.x, beside.tri.vertices, model.turning)
+    return onto, x - wall.distance[:, None] * wall.normal
 
 
 def rim_speed(model: Model, beside: Beside) -> Array:
@@ -325,7 +376,9 @@ def clearance(scene: Scene, s: State) -> np.ndarray | None:
     """
     if s.solid is None:
         return None
-    at = into_frame(s.x, turning_of(scene, s.x.dtype), s.solid.angle)
+    turning = turning_of(scene, s.x.dtype)
+    x = _images(box_of(scene, s.x.dtype), s.x, s.solid.tri.vertices, turning)
+    at = into_frame(x, turning, s.solid.angle)
     signed = s.solid.tri.update(at).signed_distance(at)
     free = np.asarray(signed.mask) if scene.wall is None else np.asarray(signed.mask) & ~scene.wall
     if s.gone is not None:

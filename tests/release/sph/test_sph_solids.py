@@ -13,7 +13,7 @@ from test_sph_commands import invoke, read_table
 
 from experiments.sph import answers, scenes
 from jfrnn.cases import fluids, meshes
-from jfrnn.sph import budget, force_on_solid, health, solids, solver, view
+from jfrnn.sph import budget, force_on_solid, frames, health, solids, solver, view
 from jfrnn.sph.errors import SceneError
 from jfrnn.sph.inside import find_inside
 from jfrnn.sph.kernels import KERNELS
@@ -134,6 +134,41 @@ def test_nothing_passes_however_it_is_thrown(turning):
         if k % 5 == 4:
             assert not is_inside(s.x, scene, 0.02 * (k + 1)).any()
     assert touched > 50
+
+
+@pytest.mark.parametrize("turning", [None, fluids.Turning((1.5, 0.5), None, 2.0)])
+def test_a_solid_in_a_periodic_box_meets_every_image_of_the_fluid(turning):
+    """Fluid that begins some periods farther along moves likewise, and feels the solid likewise; else it would go through."""
+    corners, dx = np.array([[1.3, 0.4], [1.6, 0.4], [1.6, 0.7], [1.3, 0.7]]), 0.05
+    x = fluids.lattice((0, 0), (40, 20), dx)
+    x = x[np.linalg.norm(x - [1.5, 0.5], axis=1) > 0.27 + dx]
+    solid = fluids.Solid(corners, np.array([[0, 1], [1, 2], [2, 3], [3, 0]], np.int32), turning)
+    box = fluids.Periodic((0.0, 0.0), (2.0, 1.0), (True, True))
+    wind = {"velocities": np.tile([1.0, 0.0], (len(x), 1)), "viscosity": 0.01}
+    near = replace(beside(solid, x, dx, **wind), periodic=box)
+    moved = np.random.default_rng(3).integers(-2, 3, x.shape) * np.array(box.lengths)
+    far = replace(near, positions=x + moved)
+    probe, ends = force_on_solid(), []
+    for scene in (near, far):
+        model = make_model(scene)
+        s, _ = solver.advance(model, solver.begin(model, make_state(scene)), None, 250)
+        assert health.complaint(scene, s) is None
+        assert not is_inside(frames.wrap_positions(scene, np.asarray(s.x)), scene, float(s.time)).any()
+        ends.append((np.asarray(s.x), np.asarray(s.v), probe(model, s)))
+    (one, speed, onto), (other, likewise, onto_too) = ends
+    np.testing.assert_allclose(other - moved, one, atol=1e-8)
+    np.testing.assert_allclose(likewise, speed, atol=1e-6)
+    np.testing.assert_allclose(onto_too["torque"], onto["torque"], rtol=1e-5)
+    assert np.linalg.norm(onto["force"]) > 0.01
+    refuses(
+        SceneError,
+        "periodic box must be .* m wide along y beside this solid, so that no particle is within reach of two images",
+        make_model,
+        replace(near, periodic=fluids.Periodic((0.0, 0.0), (2.0, 0.5), (True, True))),
+    )
+    deep = replace(near, positions=np.concatenate([x, [[3.45, 0.55]]]), masses=np.resize(near.masses, len(x) + 1))
+    deep = replace(deep, velocities=np.zeros((len(x) + 1, 2)))
+    refuses(SceneError, rf"particle {len(x)} is not", make_state, deep)
 
 
 def safe_state(scene):
