@@ -22,7 +22,7 @@ def draw(scene: Scene, there: np.ndarray, x: np.ndarray, v: np.ndarray, time: fl
     `there` says which particles take part, shape [n], bool, of positions x [m] and velocities v [m/s], shape [n, d], at a time [s].
     The frame is the bounds of the scene, and the color scale ends at `top_speed` [m/s].
     """
-    aslant = scene.solid is not None and scene.dim == 3
+    x, aslant = view.wrap_positions(scene, x), scene.solid is not None and scene.dim == 3
     lower, upper = picture_bounds(scene)
     wide, high = (upper - lower)[[0, -1]]
     tall = 6.0 if aslant else min(max(7.0 * high / max(wide, 1e-300), 2.5) + 0.8, 9.0)
@@ -44,7 +44,6 @@ def draw(scene: Scene, there: np.ndarray, x: np.ndarray, v: np.ndarray, time: fl
 def _draw_from_side(
     axes: Axes, scene: Scene, there: np.ndarray, x: np.ndarray, v: np.ndarray, time: float, scale: ScalarMappable
 ) -> None:
-    x = wrap_positions(scene, x)
     wall = np.zeros(scene.n, bool) if scene.wall is None else scene.wall
     depth = np.argsort(x[:, 1]) if scene.dim == 3 else np.arange(scene.n)
     seen = depth[(there & ~wall)[depth]]
@@ -64,14 +63,6 @@ def picture_bounds(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     if scene.bounds is None:
         return scene.positions.min(axis=0), scene.positions.max(axis=0)
     return np.array(scene.bounds.lower), np.array(scene.bounds.upper)
-
-
-def wrap_positions(scene: Scene, x: np.ndarray) -> np.ndarray:
-    """Return positions inside the periodic box, where there is one."""
-    if scene.periodic is None:
-        return x
-    lower, lengths = np.array(scene.periodic.lower), np.array(scene.periodic.lengths)
-    return np.where(scene.periodic.axes, lower + (x - lower) % lengths, x)
 
 
 def animate(folder: Path, path: Path, seconds: float = 0.08) -> Path | None:

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jfrnn.cases.fluids import Scene
-from jfrnn.sph import budget, origin, solids, solver
+from jfrnn.sph import budget, origin, solids, solver, view
 from jfrnn.sph.errors import SceneError
 from jfrnn.sph.model import kind_of
 from jfrnn.sph.particles import Flow, State, Thermal
@@ -39,7 +39,7 @@ def are_there(scene: Scene, s: State) -> np.ndarray:
 
 
 def save(state: State, scene: Scene, rho: np.ndarray, p: np.ndarray, folder: Path, step: int) -> None:
-    """Write a state as STEP.npz, complete or not at all, and its particles that have entered as STEP.vtp."""
+    """Write a state as STEP.npz, complete or not at all, and its particles that have entered as STEP.vtp, in the periodic box."""
     folder.mkdir(parents=True, exist_ok=True)
     parts = state._asdict() | ({} if state.gas is None else state.gas._asdict())
     arrays = {name: np.asarray(value) for name, value in parts.items() if value is not None and name not in ("solid", "gas")}
@@ -203,7 +203,7 @@ def _write_vtk(arrays: dict[str, np.ndarray], scene: Scene, there: np.ndarray, v
     import pyvista
 
     flat = ((0, 0), (0, 3 - scene.dim))
-    cloud = pyvista.PolyData(np.pad(arrays["x"][there], flat))
+    cloud = pyvista.PolyData(np.pad(view.wrap_positions(scene, arrays["x"])[there], flat))
     arrays_there = {"velocity": np.pad(arrays["v"][there], flat)} | {name: value[there] for name, value in values.items()}
     if scene.wall is not None:
         arrays_there["wall"] = scene.wall[there].astype(np.uint8)

@@ -42,6 +42,14 @@ def render(scene: Scene, x: np.ndarray, colors: np.ndarray, time: float) -> np.n
     return canvas.colors[::-1]
 
 
+def wrap_positions(scene: Scene, x: np.ndarray) -> np.ndarray:
+    """Return positions [n, d] inside the periodic box, where there is one; those that are in it stay as they are."""
+    if scene.periodic is None:
+        return x
+    lower, lengths = np.array(scene.periodic.lower), np.array(scene.periodic.lengths)
+    return np.where(scene.periodic.axes, x - np.floor((x - lower) / lengths) * lengths, x)
+
+
 def turn_vertices(vertices: np.ndarray, turning: Turning[float, tuple[float, ...]] | None, time: float) -> np.ndarray:
     """Return the corners of a solid [v, d] at a time [s]."""
     if turning is None:

@@ -98,6 +98,22 @@ def test_probes_and_outflow_meet_particles_in_a_periodic_box():
     assert not np.asarray(end.gone).any()
 
 
+def test_what_paraview_reads_stays_in_the_periodic_box(tmp_path):
+    """Positions of a state go on beyond it, which a run goes on from; a reader sees the box, as in pictures."""
+    import pyvista
+
+    box = fluids.Periodic((0.25, 0.0), (1.0, 1.0), (True, False))
+    x = np.array([[0.5, 0.5], [1.0, 1.5], [0.25, 0.75]])
+    scene = replace(FREE, positions=x, velocities=np.tile([3.0, 0.0], (3, 1)), periodic=box, duration=1.0)
+    end = sph.run(scene, tmp_path, sph.How(frames=1, pictures=False))
+    clouds = [pyvista.read(path) for path in sorted((tmp_path / "snapshots").glob("*.vtp"))]
+    np.testing.assert_array_equal(clouds[0].points[:, :2], x.astype(clouds[0].points.dtype))
+    seen = clouds[-1].points
+    assert (seen[:, 0] >= 0.25).all() and (seen[:, 0] < 1.25 + 1e-6).all()
+    np.testing.assert_allclose(np.asarray(end.x)[:, 0] - seen[:, 0], np.round(np.asarray(end.x)[:, 0] - seen[:, 0]), atol=1e-5)
+    np.testing.assert_array_equal(seen[:, 1], np.asarray(end.x)[:, 1].astype(seen.dtype))
+
+
 def test_particles_that_leave_are_gone_and_counted(tmp_path):
     """One of three goes over the border; another one enters later."""
     scene = replace(FREE, outflow=sph.Tank((-1.0, -1.0), (0.3, 30.0)), enters=np.array([0.0, 0.8, 0.0]))

@@ -13,7 +13,7 @@ from test_sph_commands import invoke, read_table
 
 from experiments.sph import answers, scenes
 from jfrnn.cases import fluids, meshes
-from jfrnn.sph import budget, force_on_solid, frames, health, solids, solver, view
+from jfrnn.sph import budget, force_on_solid, health, solids, solver, view
 from jfrnn.sph.errors import SceneError
 from jfrnn.sph.inside import find_inside
 from jfrnn.sph.kernels import KERNELS
@@ -153,7 +153,7 @@ def test_a_solid_in_a_periodic_box_meets_every_image_of_the_fluid(turning):
         model = make_model(scene)
         s, _ = solver.advance(model, solver.begin(model, make_state(scene)), None, 250)
         assert health.complaint(scene, s) is None
-        assert not is_inside(frames.wrap_positions(scene, np.asarray(s.x)), scene, float(s.time)).any()
+        assert not is_inside(view.wrap_positions(scene, np.asarray(s.x)), scene, float(s.time)).any()
         ends.append((np.asarray(s.x), np.asarray(s.v), probe(model, s)))
     (one, speed, onto), (other, likewise, onto_too) = ends
     np.testing.assert_allclose(other - moved, one, atol=1e-8)
