@@ -280,7 +280,7 @@ class TriangleList:
         self._check_rows()
         if 0 in (*self.idx.shape, self.faces.shape[0]):
             none = jnp.zeros(points.shape[0], points.dtype)
-            return SignedDistance(none, none > 0, jnp.zeros_like(points), jnp.asarray(self.faces.shape[0] == 0))
+            return SignedDistance(none, none > 0, jnp.zeros_like(points), _watertight_alone(self, corners))
         tri = self if vertices is None else dataclasses.replace(self, cells=None)
         found = _signed_distance(tri, points, corners)
         return found._replace(distance=self._mark(found.distance), normal=self._mark(found.normal))
@@ -370,6 +370,18 @@ def _are_parted(tri: TriangleList, points: Array, vertices: Array, pairs: Array)
     return call_apart(are_crossed, *lax.stop_gradient((points, corners)), finite & there, tri.idx, used, known)
 
 
+def _is_watertight(tri: TriangleList, good: Array) -> Array:
+    """Say whether a wall whose faces are all `good` [f] bool encloses something, or has none: [] bool."""
+    return (is_closed(tri.faces) if tri.closed is None else tri.closed) & jnp.all(good)
+
+
+@compile_program
+def _watertight_alone(tri: TriangleList, vertices: Array) -> Array:
+    """Say whether a wall with these vertices [v, d] is watertight, where there is nothing else to say."""
+    _, finite, there = gather_corners(vertices, tri.faces)
+    return _is_watertight(tri, finite & there)
+
+
 @compile_program
 def _signed_distance(tri: TriangleList, points: Array, vertices: Array) -> SignedDistance:
     corners, finite, there = gather_corners(vertices, tri.faces)
@@ -381,7 +393,7 @@ def _signed_distance(tri: TriangleList, points: Array, vertices: Array) -> Signe
     vectors, feature = nearest_of(jnp.where(some[:, None], points, 0), shapes)
     away, distance = -vectors, norms(vectors)
     apart = some & (distance > 0)
-    watertight = (is_closed(tri.faces) if tri.closed is None else tri.closed) & jnp.all(good)
+    watertight = _is_watertight(tri, good)
     tree = tri.cells if isinstance(tri.cells, TriangleTree) else None
 
     def sides(tree: TriangleTree | None, corners: Array, points: Array, good: Array, asked: Array) -> tuple[Array, Array]:

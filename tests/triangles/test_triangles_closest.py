@@ -269,6 +269,23 @@ def test_sides_of_a_wall_that_is_open():
     assert np.all(np.asarray(signed.distance[120:]) < 0)
 
 
+@pytest.mark.parametrize("traced", [False, True])
+def test_a_wall_is_as_watertight_without_particles(traced):
+    vertices, faces = meshes.cube(2.0, 1)
+    lost = vertices.copy()
+    lost[0, 0] = np.nan
+
+    def watertight(vertices, faces):
+        none = jfrnn.search_triangles(np.zeros((0, 3)), vertices, faces, 0.5, capacity=1)
+        return none.signed_distance(np.zeros((0, 3))).watertight
+
+    told = jax.jit(watertight) if traced else watertight
+    assert told(vertices, faces)
+    assert told(vertices, faces[:0])
+    assert not told(vertices, faces[1:])
+    assert not told(lost, faces)
+
+
 def test_a_wall_with_a_lost_corner_is_not_watertight():
     """It has a hole there, through which rays go; the sides of the other faces are those of the cube."""
     vertices, faces = meshes.cube(2.0, 2)
