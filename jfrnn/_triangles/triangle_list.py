@@ -327,8 +327,10 @@ class TriangleList:
         return _are_parted(self, points, corners, jnp.asarray(asked))
 
     def _check_points(self, positions: Points, vertices: Points | None) -> tuple[Array, Array]:
-        dtype, (count, dim) = np.dtype(self.vertices.dtype), self.vertices.shape
-        points = geometry.check_again("positions", positions, dtype, dim, self.idx.shape[0], self.idx)
+        dtype, (count, dim) = np.dtype(self.vertices.dtype), self.vertices.shape[-2:]  # of several walls, which vmap made, too
+        points = geometry.check_again("positions", positions, dtype, dim, self.idx.shape[-2], self.idx)
+        if self.idx.ndim != 2:
+            raise ValueError(f"a list at a time is asked, got idx of shape {list(self.idx.shape)}: take jax.vmap, as made it.")
         if vertices is None:
             return points, self.vertices
         return points, geometry.check_again("vertices", vertices, dtype, dim, count, self.idx)

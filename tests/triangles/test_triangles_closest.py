@@ -286,6 +286,17 @@ def test_a_wall_is_as_watertight_without_particles(traced):
     assert not told(lost, faces)
 
 
+def test_lists_that_vmap_made_are_asked_one_at_a_time():
+    vertices, faces = meshes.cube(2.0, 1)
+    x = np.random.default_rng(0).uniform(0.8, 1.2, (2, 5, 3))
+    both = jax.vmap(lambda x: jfrnn.search_triangles(x, vertices, faces, 0.5, capacity=12))(x)
+    for positions, match in ((x, "positions must have shape"), (x[0], r"a list at a time is asked, got idx of shape \[2, 5, 12\]")):
+        for asked in (both.closest, both.contacts, both.signed_distance, both.update, both.grow):
+            with pytest.raises(ValueError, match=match):
+                asked(positions)
+    assert jax.vmap(lambda tri, x: tri.signed_distance(x).mask)(both, x).any()
+
+
 def test_a_wall_with_a_lost_corner_is_not_watertight():
     """It has a hole there, through which rays go; the sides of the other faces are those of the cube."""
     vertices, faces = meshes.cube(2.0, 2)
