@@ -13,10 +13,13 @@ def kinetic_energy(model: Flow, s: State) -> Array:
 
 
 def potential_energy(model: Model, s: State) -> Array:
-    """Return -Σ m g·(x - x0) of the fluid [J], shape []; x0 is the lower corner of the tank, or the origin. 0 without gravity."""
+    """Return -Σ m g·(x - x0) of the fluid [J], shape []; 0 without gravity.
+
+    x0 is the lower corner of the tank, and 0 along axes on which there is none, or where the tank is open downwards.
+    """
     if model.physics.gravity is None:
         return jnp.zeros((), s.x.dtype)
-    ground = jnp.zeros((), s.x.dtype) if model.tank is None else model.tank[0]
+    ground = jnp.zeros((), s.x.dtype) if model.tank is None else jnp.where(jnp.isfinite(model.tank[0]), model.tank[0], 0)
     return -jnp.sum(mass_there(model, s) * jnp.sum((s.x - ground) * model.physics.gravity, axis=1))
 
 

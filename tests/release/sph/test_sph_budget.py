@@ -71,3 +71,11 @@ def test_energy_of_compression_needs_densities():
     scene = changed(DROP, evolve="pressure")
     with pytest.raises(ValueError, match="needs carried densities, got evolve 'pressure': take 'continuity'"):
         budget.internal_energy(make_model(scene), make_state(scene))
+
+
+def test_a_tank_that_is_open_on_some_sides_has_an_energy():
+    """Heights are those over its floor; where there is no wall, over 0."""
+    scene = changed(replace(DROP, tank=fluids.Tank((-np.inf, -3.0), (np.inf, np.inf))), restitution=0.5, gravity=(0.5, -2.0))
+    x, m = scene.positions, scene.masses
+    expected = np.sum(m * (2.0 * (x[:, 1] + 3.0) - 0.5 * x[:, 0]))
+    assert float(budget.potential_energy(make_model(scene), make_state(scene))) == pytest.approx(expected, rel=1e-12)
