@@ -3,7 +3,7 @@
 import numpy as np
 
 from jfrnn.cases.fluids import Scene
-from jfrnn.sph import solids, solver
+from jfrnn.sph import solids, solver, view
 from jfrnn.sph.errors import DivergedError
 from jfrnn.sph.pairs import Neighbors
 from jfrnn.sph.particles import Flow, State
@@ -20,7 +20,7 @@ def complaint(scene: Scene, s: State) -> str | None:
         return f"particle {distances.argmin()} went through the wall of triangles, {-distances.min()} m deep"
     if scene.sealed is None:
         return None
-    x, far = np.asarray(s.x), scene.spacing / 2
+    x, far = view.wrap_positions(scene, np.asarray(s.x)), scene.spacing / 2
     outside = ((x < np.array(scene.sealed.lower) - far) | (x > np.array(scene.sealed.upper) + far)).any(axis=1)
     if scene.wall is not None:
         outside &= ~scene.wall

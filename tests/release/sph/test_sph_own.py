@@ -24,7 +24,7 @@ import jfrnn
 from jfrnn import sph
 from jfrnn.cases import fluids
 from jfrnn.sph import toml_scenes
-from jfrnn.sph.errors import SceneError
+from jfrnn.sph.errors import DivergedError, SceneError
 from jfrnn.sph.particles import mass_there
 
 FEW = np.array([[0.0, 0.0], [10.0, 0.0], [0.0, 20.0]])  # none is near another
@@ -112,6 +112,18 @@ def test_what_paraview_reads_stays_in_the_periodic_box(tmp_path):
     assert (seen[:, 0] >= 0.25).all() and (seen[:, 0] < 1.25 + 1e-6).all()
     np.testing.assert_allclose(np.asarray(end.x)[:, 0] - seen[:, 0], np.round(np.asarray(end.x)[:, 0] - seen[:, 0]), atol=1e-5)
     np.testing.assert_array_equal(seen[:, 1], np.asarray(end.x)[:, 1].astype(seen.dtype))
+
+
+def test_who_goes_around_a_periodic_box_stays_in_what_is_sealed(tmp_path):
+    box, channel = fluids.Periodic((0.0, 0.0), (1.0, 1.0), (True, False)), sph.Tank((0.0, 0.0), (1.0, 2.0))
+    x, v = np.array([[0.5, 0.5], [0.5, 1.0], [0.25, 1.5]]), np.tile([3.0, 0.0], (3, 1))
+    scene = replace(FREE, positions=x, velocities=v, periodic=box, sealed=channel)
+    end = sph.run(scene, tmp_path / "along", sph.How(frames=1, pictures=False))
+    assert (np.asarray(end.x)[:, 0] > 1.0).all()
+    across = replace(scene, velocities=np.tile([0.0, 3.0], (3, 1)))
+    refuses(
+        DivergedError, "particle 2 went through a wall", sph.run, across, tmp_path / "across", sph.How(frames=1, pictures=False)
+    )
 
 
 def test_particles_that_leave_are_gone_and_counted(tmp_path):
