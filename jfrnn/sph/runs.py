@@ -243,10 +243,10 @@ class _Writer:
             there = snapshots.are_there(scene, s)
             frames.draw(scene, there, x, v, time, float(top), self._folder / "frames" / f"{step:09d}.png")
         snapshots.save(s, scene, np.asarray(rho), np.asarray(p), self._folder / "snapshots", step)
-        snapshots.add_to_series(self._folder / f"{scene.name}.pvd", self._line["time"], step)
         self.series(step)
 
     def series(self, step: int) -> None:
-        """Bring the one file of all snapshots up to this step, where it is asked for."""
+        """Bring the series up to this step, which a kill may have kept from it: that of files, and the one file if asked for."""
+        snapshots.add_to_series(self._folder / f"{self._scene.name}.pvd", self._line["time"], step)
         if self._how.hdf:
             series.follow(self._folder / f"{self._scene.name}.vtkhdf", self._folder / "snapshots", step)

@@ -64,6 +64,18 @@ def test_a_killed_run_goes_on_to_the_same_end(tmp_path, neighbors):
     np.testing.assert_allclose(load(whole, 30)["x"], load(killed, 30)["x"], rtol=tolerance)
 
 
+@pytest.mark.parametrize("step", [20, 30])
+def test_a_run_that_was_killed_after_a_snapshot_brings_its_series_up_to_it(tmp_path, step):
+    invoke("four", *FEW, "--no-pictures", "--out", tmp_path)
+    series = tmp_path / "four.pvd"
+    whole = series.read_text()
+    for later in range(step + 10, 40, 10):
+        (tmp_path / "snapshots" / f"{later:09d}.npz").unlink()
+    series.write_text("\n".join(line for line in whole.splitlines() if f"{step:09d}" not in line) + "\n")
+    invoke("four", *FEW, "--no-pictures", "--out", tmp_path)
+    assert series.read_text() == whole
+
+
 def test_stopped_runs_go_on_to_the_same_end(tmp_path, tries=3):
     """Ctrl-C at any time, also while JAX calls back into Python, ends a run with 130; the same command then ends as a whole one."""
     options = ("four", "--set", "duration=0.004", "--frames", 4, "--no-pictures")
