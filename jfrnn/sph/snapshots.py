@@ -93,7 +93,7 @@ def check_same(about: dict[str, Any], folder: Path) -> None:
         raise SceneError(f"{folder}: holds snapshots, but no run.json that says of what; take another folder, or remove it")
     text = json.dumps(about | {"units": UNITS, "made_by": origin.tell()}, indent=1, sort_keys=True)
     if not path.exists():
-        path.write_text(text)
+        _write_whole(text, path)
         return
     try:
         there = dict(json.loads(path.read_text()))
@@ -102,11 +102,18 @@ def check_same(about: dict[str, Any], folder: Path) -> None:
     asked = json.loads(json.dumps(about))
     there = {key: value for key, value in there.items() if key not in ("units", "made_by")}
     if _goes_on(there, asked):
-        path.write_text(text)
+        _write_whole(text, path)
         return
     if there != asked:
         different = [key for key in asked if asked[key] != there.get(key)]
         raise SceneError(f"{folder}: holds a run with another {', '.join(different)}; take another folder, or remove it")
+
+
+def _write_whole(text: str, path: Path) -> None:
+    """Write a file, complete or not at all: a kill, or a full disk, leaves the one that was there."""
+    part = path.with_suffix(".part")
+    part.write_text(text)
+    part.replace(path)
 
 
 def _goes_on(there: dict[str, Any], asked: dict[str, Any]) -> bool:
@@ -163,9 +170,7 @@ def add_line(line: dict[str, float], path: Path, step: int) -> None:
     """
     text = check_columns(line, path)
     text = text[:1] + [old for old in text[1:] if int(old.split(",")[0]) < step]
-    part = path.with_suffix(".part")
-    part.write_text("\n".join([*text, ",".join([str(step), *(f"{value:.12g}" for value in line.values())])]) + "\n")
-    part.replace(path)
+    _write_whole("\n".join([*text, ",".join([str(step), *(f"{value:.12g}" for value in line.values())])]) + "\n", path)
 
 
 def check_columns(line: dict[str, float], path: Path) -> list[str]:
@@ -193,10 +198,8 @@ def add_to_series(path: Path, time: float, step: int) -> None:
         lines = re.findall(r'^(<DataSet .*file="snapshots/(\d+)\.vtp"/>)$', path.read_text(), re.MULTILINE)
         kept = [line for line, number in lines if int(number) < step]
     kept.append(f'<DataSet timestep="{time:.12g}" file="snapshots/{step:09d}.vtp"/>')
-    part = path.with_suffix(".part")
     text = "\n".join(['<VTKFile type="Collection" version="0.1">', "<Collection>", *kept, "</Collection>", "</VTKFile>", ""])
-    part.write_text(text)
-    part.replace(path)
+    _write_whole(text, path)
 
 
 def _write_vtk(arrays: dict[str, np.ndarray], scene: Scene, there: np.ndarray, values: dict[str, np.ndarray], path: Path) -> None:

@@ -1,11 +1,13 @@
 """`python -m jfrnn.sph run`: what a run writes, how it goes on after a kill, and what it says when it goes wrong."""
 
+import errno
 import json
 import os
 import re
 import signal
 import threading
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -74,6 +76,28 @@ def test_a_run_that_was_killed_after_a_snapshot_brings_its_series_up_to_it(tmp_p
     series.write_text("\n".join(line for line in whole.splitlines() if f"{step:09d}" not in line) + "\n")
     invoke("four", *FEW, "--no-pictures", "--out", tmp_path)
     assert series.read_text() == whole
+
+
+@pytest.mark.parametrize("longer", [False, True])
+def test_a_disk_that_is_full_while_run_json_is_written_leaves_a_folder_to_go_on_in(tmp_path, monkeypatch, longer):
+    options = ("four", "--set", "step=1e-4", "--no-pictures", "--out", tmp_path)
+    if longer:
+        invoke(*options, "--set", "duration=0.001", "--frames", 1)
+    write = Path.write_text
+
+    def fill(path, text):
+        if path.stem != "run":
+            return write(path, text)
+        write(path, text[: len(text) // 2])
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+
+    monkeypatch.setattr(Path, "write_text", fill)
+    code, _, err = invoke(*options, "--set", "duration=0.002", "--frames", 2)
+    assert code == 2
+    assert "No space left on device" in err
+    monkeypatch.undo()
+    assert invoke(*options, "--set", "duration=0.002", "--frames", 2)[0] == 0
+    assert load(tmp_path, 20)["time"] == pytest.approx(0.002)
 
 
 def test_stopped_runs_go_on_to_the_same_end(tmp_path, tries=3):
