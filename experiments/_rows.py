@@ -4,6 +4,7 @@ import fcntl
 import gzip
 import json
 import os
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, fields
@@ -195,7 +196,10 @@ class RowFile(Generic[RowT]):
 def read_text(path: Path) -> str:
     """Return what is packed beside a file (as PATH.gz), and then what the file holds; nothing where there is neither."""
     packed = path.with_name(f"{path.name}.gz")
-    data = gzip.decompress(packed.read_bytes()) if packed.exists() else b""
+    try:
+        data = gzip.decompress(packed.read_bytes()) if packed.exists() else b""
+    except (EOFError, gzip.BadGzipFile, zlib.error) as error:
+        raise UsageError(f"{packed}: cannot be unpacked ({error}): pack its rows anew, or remove it") from error
     if path.exists():
         data += path.read_bytes()
     return data.decode("utf-8", errors="replace")  # bytes that are no text make a line that is no row, and is named

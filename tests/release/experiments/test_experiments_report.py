@@ -319,6 +319,13 @@ def test_rows_that_are_packed_come_before_those_that_were_added(tmp_path):
     assert file.read() == [replace(old, median_s=7.0), new]
 
 
+@pytest.mark.parametrize("damage", [lambda data: data[:60], lambda data: data[:-9] + b"123456789", lambda _: b"no gzip"])
+def test_rows_that_cannot_be_unpacked_are_named(tmp_path, damage):
+    RowFile(tmp_path).append(make_rows()[0])
+    (tmp_path / "rows.jsonl.gz").write_bytes(damage(gzip.compress((tmp_path / "rows.jsonl").read_bytes())))
+    assert "rows.jsonl.gz: cannot be unpacked" in refused("report", tmp_path)
+
+
 def test_a_title_names_what_the_picture_shows_and_claims_nothing_beside_other_work():
     found = {"full": {"warp": 1.0, "hashgrid": 0.5, "vesin": 3.0}}
     assert _plots._only(found, ["warp", "vesin"]) == {"full": {"warp": 1.0, "vesin": 3.0}}
