@@ -303,7 +303,11 @@ _CLOSED = (
     "fn calls a function with a rule for its derivative (jax.custom_jvp or jax.custom_vjp) that closes over an array which is "
     "being traced or differentiated: hand that array over as an argument of the function."
 )
-_LOOPS = {"scan": "num_consts", "while": "body_nconsts"}  # the parameter that says how many arguments of a body stay as they are
+# how many arguments of a loop's body stay as they are
+_FIXED = {
+    "scan": lambda params: params["num_consts"] if "num_consts" in params else len(params["ft_in"].unpack()[0]),  # before JAX 0.11
+    "while": lambda params: params["body_nconsts"],
+}
 
 
 def _refuse_constants(jaxpr: Jaxpr, moving: Sequence[bool]) -> None:
@@ -318,8 +322,8 @@ def _refuse_constants(jaxpr: Jaxpr, moving: Sequence[bool]) -> None:
         else:
             for inner in _inner(params):
                 given = moves[len(moves) - len(inner.jaxpr.invars) :]
-                if name in _LOOPS:  # what is carried may move after a turn
-                    fixed = params[_LOOPS[name]]
+                if name in _FIXED:  # what is carried may move after a turn
+                    fixed = _FIXED[name](params)
                     given[fixed:] = [any(moves)] * (len(given) - fixed)
                 _refuse_constants(inner.jaxpr, given)
         if any(moves) and name != "stop_gradient":

@@ -163,7 +163,8 @@ def check_images(scene: FluidScene) -> None:
     if solid.turning is None:
         farthest = np.abs(r).max(axis=0)
     else:
-        axis = np.zeros(scene.dim) if solid.turning.axis is None else solid.turning.axis / np.linalg.norm(solid.turning.axis)
+        given = np.zeros(scene.dim) if solid.turning.axis is None else np.asarray(solid.turning.axis, np.float64)
+        axis = given / (np.linalg.norm(given) or 1)
         along = r @ axis
         around = np.linalg.norm(r - along[:, None] * axis, axis=1)
         farthest = (np.abs(along[:, None] * axis) + around[:, None] * np.sqrt(np.maximum(1 - axis**2, 0))).max(axis=0)
