@@ -1,6 +1,7 @@
 """What padded and flat lists share: checks of what they are given later, updates in a loop, and growth after an overflow."""
 
 import dataclasses
+import functools
 import math
 from collections.abc import Callable, Sequence
 from types import FunctionType
@@ -19,7 +20,7 @@ from jfrnn._search.geometry import real_points
 from jfrnn._search.present import ImageCodes, Present, Reverse, Topology
 from jfrnn._search.problem import KeptOptions, Problem, find_fields
 from jfrnn._search.verlet import Verlet, has_moved_too_far
-from jfrnn._tracing import Flags, Given, Numbers, Points, Real, call_apart, compile_program, on_platform, own_transfers
+from jfrnn._tracing import Flags, Given, Numbers, Points, Real, call_apart, call_late, compile_program, on_platform, own_transfers
 
 Kept = TypeVar("Kept", bound="KeptSearch")
 
@@ -313,7 +314,8 @@ def _update(
     if not stays and nbrs.box_numbers is not None:
         nbrs = _replace(nbrs, box_numbers=nbrs._find_box_numbers(inputs))
     if stays and nbrs._may_renew(inputs):
-        return on_platform(nbrs, inputs, cuda=type(nbrs)._renew, default=_make_again_if_stale)
+        by = functools.partial(on_platform, cuda=type(nbrs)._renew, default=_make_again_if_stale)
+        return call_late(by, (nbrs, inputs), nbrs)
     return _make_again_if_stale(nbrs, inputs, stays)
 
 
@@ -343,7 +345,8 @@ def _make_again_if_stale(nbrs: Kept, inputs: Inputs, stays: bool = False) -> Kep
     box = inputs.box
     radii = inputs.cutoff if isinstance(inputs.cutoff, geometry.Radii) else None
     if stays and can_ask(inputs, nbrs.problem.options, nbrs.skin, "cpu"):
-        moved = on_platform(nbrs, inputs, cpu=_kernel_says_so, default=_has_moved_too_far)
+        by = functools.partial(on_platform, cpu=_kernel_says_so, default=_has_moved_too_far)
+        moved = call_late(by, (nbrs, inputs), jax.ShapeDtypeStruct((), bool))
     else:
         moved = _has_moved_too_far(nbrs, inputs)
     fixed = {"box": box, "box_numbers": nbrs.box_numbers, "radii": radii, "batch": nbrs.batch, "exclude": nbrs.exclude}
