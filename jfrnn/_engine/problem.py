@@ -164,7 +164,6 @@ class Inputs(NamedTuple):
     cutoff: geometry.Cutoff | geometry.Radii  # of the list: a single one that includes the skin, or per-particle ones that do not
     batch: geometry.Batch | None = None
     exclude: geometry.Exclusions | None = None
-    known: geometry.KnownBox = geometry.KnownBox()
 
 
 def hide_inactive(positions: Array, active: Array | None) -> Array:
@@ -222,7 +221,7 @@ def prepare_search(inputs: Inputs, options: Options, bring: Bring | None = None)
     `bring` brings particles near a box, if there is one for all, whose vectors are those that were given; array programs do else.
     """
     asked = lax.stop_gradient(inputs)
-    given, queries, active, box, cutoff, batch, exclude, known = take_present(asked)
+    given, queries, active, box, cutoff, batch, exclude = take_present(asked)
     sources, images = hide_inactive(given, active), options.images
     per_system = box is not None and box.per_system and batch is not None
     batch = None if batch is None or per_system else geometry.rank_systems(batch)
@@ -237,7 +236,7 @@ def prepare_search(inputs: Inputs, options: Options, bring: Bring | None = None)
     if box is None or images is None:
         excluded = None if exclude is None else geometry.exclude_in_space(exclude.rows)
         return Search(sources, queries, cutoff, batch, None, checks, excluded)
-    lattice = known.lattice or geometry.make_lattice(box, images, np.dtype(sources.dtype))
+    lattice = geometry.make_lattice(box, images, np.dtype(sources.dtype))
     clouds, moved = [x for x in (sources, queries) if x is not None], None
     named = exclude is not None and exclude.rows.shifts is not None  # images, between points that were not moved
     brought = None
@@ -250,7 +249,7 @@ def prepare_search(inputs: Inputs, options: Options, bring: Bring | None = None)
         near = [geometry.bring_near(x, lattice) for x in clouds]
         points, moved = [x.points for x in near], (near[0].turns, near[-1].turns)
     sources, queries = points[0], None if queries is None else points[1]
-    wrapped = geometry.wrap(sources, queries, lattice, largest_radius(cutoff), brought=brought, known=known.bounding)
+    wrapped = geometry.wrap(sources, queries, lattice, largest_radius(cutoff), brought=brought, box=box)
     excluded = None if exclude is None else geometry.exclude_in_lattice(exclude.rows, lattice, wrapped, moved, None)
     checks[geometry.Status.BOX_TOO_SMALL] = wrapped.enough
     checks[geometry.Status.OUT_OF_RANGE] = (wrapped.met & geometry.TOO_FAR) == 0

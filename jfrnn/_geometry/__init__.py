@@ -62,6 +62,7 @@ from jfrnn._geometry.inputs import (
 )
 from jfrnn._geometry.integers import GUARDS, carry_limbs, fields_of, full_count, limb_bits, limb_sign, limbs_of
 from jfrnn._geometry.lattice import (
+    KnownBox,
     Lattice,
     Near,
     bring_near,
@@ -70,6 +71,7 @@ from jfrnn._geometry.lattice import (
     given_shifts,
     make_lattice,
     nearest_shifts,
+    plain_box,
     shift_pairs,
     sides_of,
     translation,
@@ -95,11 +97,11 @@ from jfrnn._geometry.status import (
 from jfrnn._geometry.wrapping import (
     NOT_FINITE,
     TOO_FAR,
-    KnownBox,
     NearRows,
     Wrapped,
     bound_wrapping,
     find_bounding,
+    find_known,
     known_box,
     unpack_turns,
     wrap,

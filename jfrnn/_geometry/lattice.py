@@ -7,7 +7,8 @@ lattice; `given_shifts` converts such shifts to the given vectors.
 import dataclasses
 import functools
 import itertools
-from typing import NamedTuple
+from collections.abc import Iterable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -73,8 +74,57 @@ class Lattice:
         return x.reshape(*x.shape[:-1], *(1,) * (ndim - x.ndim), x.shape[-1])
 
 
+@jax.tree_util.register_pytree_with_keys_class
+class KnownBox(Box):
+    """A box whose lattice was found before: XLA takes longer to compile that than all that a search in a box is besides.
+
+    `found` holds its numbers, and behind these what `jfrnn._geometry.wrapping` has found. Whose box this is, gets a plain one.
+    """
+
+    found: Array
+
+    @classmethod
+    def of(cls, box: Box, found: Array) -> "KnownBox":
+        """Return a box, with what was found of it."""
+        known = object.__new__(cls)
+        known._set((box.vectors, box.origin, box.flags, box.numbers), box.kind)
+        object.__setattr__(known, "found", found)
+        return known
+
+    def tree_flatten_with_keys(self) -> tuple[Any, Any]:
+        """Return the arrays with their names, and the static fields."""
+        arrays, static = super().tree_flatten_with_keys()
+        return (*arrays, (jax.tree_util.GetAttrKey("found"), self.found)), static
+
+    @classmethod
+    def tree_unflatten(cls, static: tuple[Any, ...], arrays: Iterable[Any]) -> "KnownBox":
+        """Make a box from its parts without checking them again."""
+        *of_box, found = arrays
+        return cls.of(Box.tree_unflatten(static, of_box), found)
+
+    def lattice(self, images: Images) -> Lattice:
+        """Return its lattice, whose images were known when it was found."""
+        d = self.dim
+        matrix, given, transform, origin, _ = jnp.split(self.found, (d * d, 2 * d * d, 3 * d * d, 3 * d * d + d))
+        return Lattice(matrix.reshape(d, d), given.reshape(d, d), transform.reshape(d, d), origin, None, images)
+
+
+def plain_box(box: Box | None) -> Box | None:
+    """Return a box without what is known of it."""
+    if not isinstance(box, KnownBox):
+        return box
+    return Box.tree_unflatten(box.kind, (box.vectors, box.origin, box.flags, box.numbers))
+
+
+def pack_lattice(lattice: Lattice) -> list[Array]:
+    """Return the numbers of a lattice as `KnownBox` keeps them."""
+    return [x.reshape(-1) for x in (lattice.matrix, lattice.given, lattice.transform, lattice.origin)]
+
+
 def make_lattice(box: Box, images: Images, dtype: np.dtype) -> Lattice:
     """Round a box, or one per system, to a dtype once and compute its transform."""
+    if isinstance(box, KnownBox):
+        return box.lattice(images)
     vectors, origin = jnp.asarray(box.vectors).astype(dtype), jnp.asarray(box.origin).astype(dtype)
     if not box.per_system:
         matrix, given, transform = _make(vectors, None, None, box, images)

@@ -16,7 +16,18 @@ from jax import Array, lax
 from jfrnn._geometry.batch import Batch
 from jfrnn._geometry.box import Box, round_box
 from jfrnn._geometry.images import LARGEST_TURN, Images
-from jfrnn._geometry.lattice import Lattice, add_rows, fractions_of, is_valid, largest_component, make_lattice, product, translation
+from jfrnn._geometry.lattice import (
+    KnownBox,
+    Lattice,
+    add_rows,
+    fractions_of,
+    is_valid,
+    largest_component,
+    make_lattice,
+    pack_lattice,
+    product,
+    translation,
+)
 from jfrnn._tracing import Internal, at_once, compile_program, own_transfers, without_mesh
 
 _TURN_BITS = 10
@@ -125,11 +136,11 @@ def wrap(
     radius: np.floating | Array,
     batch: Batch | None = None,
     brought: list[NearRows] | None = None,
-    known: "Bounding | None" = None,
+    box: Box | None = None,
 ) -> Wrapped:
     """Translate particles into one cell of the lattice and bound the rounding errors.
 
-    `brought` is what kernels know of the particles, `known` what lattice and radius tell of the errors, if that was found before.
+    `brought` is what kernels know of the particles; `box` may know what lattice and radius tell of the errors.
 
     Let u be the computed fractional coordinates, R = matrix @ transform - 1 the residual of the transform (periodic columns). Then
     |u_j + S - u_i - (x_j - x_i + S·A) @ transform| is at most the rounding errors of u_i and u_j plus sum |S|·|R|, and |d @
@@ -151,6 +162,7 @@ def wrap(
     met = _joined(found)
     most = _most_turns(met, dtype)
 
+    known = None if box is None else _bounding_of(box)
     if not (lattice.images.orthogonal or (lattice.flags is None and all(lattice.images.periodic))):
         largest = functools.reduce(jnp.maximum, _largest_finite(wrapped, batch, len(lattice.matrix)))
         known = find_bounding(lattice, radius, batch is not None, largest)
@@ -235,38 +247,37 @@ def bound_wrapping(most: Array, lattice: Lattice, known: Bounding) -> Bounds:
     return Bounds(slack, reach, margin, enough & known.valid)
 
 
-class KnownBox(NamedTuple):
-    """What is found of a box before a program runs; None: the program finds it.
-
-    XLA takes longer to compile this than all that a search in a box is besides, and would for each shape.
-    """
-
-    lattice: Lattice | None = None
-    bounding: Bounding | None = None
-
-
-def known_box(box: Box, images: Images, dtype: np.dtype, radius: np.floating | Array | None) -> tuple[Box, KnownBox]:
-    """Return a box, rounded to a dtype, and what is known of it where the host has its numbers; it is kept for further calls."""
+def known_box(box: Box, images: Images, dtype: np.dtype, radius: np.floating | Array | None) -> Box:
+    """Return a box, rounded to a dtype; where the host has its numbers, with what is known of it, which further calls take."""
     arrays, structure = jax.tree.flatten(box)
     if box.per_system or not all(isinstance(x, np.ndarray) for x in arrays):
-        return round_box(box, dtype), KnownBox()
+        return round_box(box, dtype)
     known = tuple((np.asarray(x, dtype).tobytes(), x.shape) for x in arrays)
     with own_transfers(), without_mesh(), at_once():
         return _known_box(structure, known, images, np.dtype(dtype), radius if isinstance(radius, np.floating) else None)
 
 
 @functools.lru_cache(maxsize=64)
-def _known_box(
-    structure: Internal, known: tuple, images: Images, dtype: np.dtype, radius: np.floating | None
-) -> tuple[Box, KnownBox]:
+def _known_box(structure: Internal, known: tuple, images: Images, dtype: np.dtype, radius: np.floating | None) -> KnownBox:
     box = jax.tree.unflatten(structure, [np.frombuffer(data, dtype).reshape(shape) for data, shape in known])
-    return _find(box, images, radius)
+    return find_known(box, images, radius)
 
 
 @functools.partial(compile_program, static_argnames="images")
-def _find(box: Box, images: Images, radius: np.floating | None) -> tuple[Box, KnownBox]:
+def find_known(box: Box, images: Images, radius: np.floating | None) -> KnownBox:
+    """Return a box of no system, with its lattice and, with a radius, what bounds the rounding errors of wrapping."""
     lattice = make_lattice(box, images, np.dtype(box.vectors.dtype))
-    return box, KnownBox(lattice, None if radius is None else find_bounding(lattice, radius))
+    bounding = [] if radius is None else [x.astype(box.vectors.dtype).reshape(-1) for x in find_bounding(lattice, radius)]
+    return KnownBox.of(box, jnp.concatenate([*pack_lattice(lattice), *bounding]))
+
+
+def _bounding_of(box: Box) -> Bounding | None:
+    """Return what a box that is known tells of rounding errors."""
+    d = box.dim
+    if not isinstance(box, KnownBox) or box.found.shape[-1] == 3 * d * d + d:
+        return None
+    valid, *others = jnp.split(box.found[3 * d * d + d :], [1 + k * d for k in range(6)])
+    return Bounding(valid[0] != 0, *others)
 
 
 def _largest_finite(clouds: list[Array], batch: Batch | None, systems: int) -> list[Array]:

@@ -57,7 +57,7 @@ class EdgeList(KeptSearch):
             room. With a skin, edges include pairs within cutoff + skin when the list was last rebuilt.
         status: Bits of `Status`, shape [], int32.
         required: The `total` that holds all pairs, shape [], int32; like the status, over all updates.
-        verlet: As in `NeighborList`, and so are box, radii, batch and problem.
+        verlet: As in `NeighborList`, and so are box, known, radii, batch and problem.
         box: The periodic box, rounded to the dtype of the positions; None in open space.
         images: The periodic image of each edge (`ImageCodes`), 1 B each; None if the minimum image suffices.
         radii: Cutoffs per particle, or None with one cutoff.

@@ -18,7 +18,7 @@ from jfrnn._engine import BoxNumbers, Inputs, Options, can_ask, has_moved, hide_
 from jfrnn._search.culprits import name_culprits
 from jfrnn._search.geometry import real_points
 from jfrnn._search.present import ImageCodes, Present, Reverse, Topology
-from jfrnn._search.problem import KeptOptions, Problem, find_fields
+from jfrnn._search.problem import KeptOptions, Problem, fields_of_box, find_fields, radius_of
 from jfrnn._search.verlet import Verlet, has_moved_too_far
 from jfrnn._tracing import Flags, Given, Numbers, Points, Real, call_apart, call_late, compile_program, on_platform, own_transfers
 
@@ -33,6 +33,7 @@ class KeptSearch(KeptOptions):
     required: Array
     verlet: Verlet | None
     box: geometry.Box | None
+    known: Array | None
     images: ImageCodes | None
     radii: geometry.Radii | None
     batch: geometry.Batch | None
@@ -65,6 +66,12 @@ class KeptSearch(KeptOptions):
     @property
     def _row_count(self) -> int:
         raise NotImplementedError
+
+    @property
+    def _box_known(self) -> geometry.Box | None:
+        """The box, with what is known of it."""
+        known = self.known
+        return self.box if self.box is None or known is None else geometry.KnownBox.of(self.box, known)
 
     def _may_renew(self, inputs: Inputs) -> bool:
         """Say whether on CUDA kernels decide whether the list is made anew, and make it."""
@@ -233,9 +240,11 @@ class KeptSearch(KeptOptions):
             images = geometry.grow_images(images, (box, self.box), reach, self.dtype, self.source_count, short)
         options = self.problem.options._replace(images=images)
         wider = _replace(self, problem=dataclasses.replace(self.problem, options=options), box_numbers=None)
+        within = self.problem.listed_within(radii)
         if box is not None and images is not None:
-            box = geometry.box_of_list(box, images, reach)
-        inputs = Inputs(sources, rows, active, box, self.problem.listed_within(radii), self.batch, self.exclude)
+            kept = geometry.box_of_list(box, images, reach)
+            box = geometry.known_box(jax.device_get(kept), images, self.dtype, radius_of(within))
+        inputs = Inputs(sources, rows, active, box, within, self.batch, self.exclude)
         with own_transfers():
             met = self._round_room(math.ceil(slack * int(np.max(np.asarray(self.required)))))
             made = _remake(wider, inputs, max(self._room, met, self._count_room(inputs, options, slack)))
@@ -287,7 +296,7 @@ class KeptSearch(KeptOptions):
         if queries is not None:
             rows = geometry.check_again("queries", queries, problem.dtype, problem.dim, self._row_count, self.status)
         if box is None:
-            box = self.box
+            box = self._box_known
         elif (box := geometry.check_box(box, sources, like=self.box)) is not None:
             if self.box is None:
                 raise ValueError("this list was made without a periodic box: leave box out.")
@@ -307,8 +316,11 @@ def _update(
 ) -> Kept:
     """Make a list anew if it is stale; without a box, in its own."""
     nbrs, sources, queries, given, radii = lax.stop_gradient((nbrs, sources, queries, box, radii))
-    stays, box = given is None, nbrs.box if given is None else given
-    inputs = Inputs(sources, queries, active, box, nbrs.problem.listed_within(radii), nbrs.batch, nbrs.exclude)
+    stays, cutoff = given is None, nbrs.problem.listed_within(radii)
+    box = nbrs._box_known if given is None else given
+    if given is not None and nbrs.known is not None and nbrs.box_kind is not None:
+        box = geometry.find_known(given, nbrs.box_kind, radius_of(cutoff))
+    inputs = Inputs(sources, queries, active, box, cutoff, nbrs.batch, nbrs.exclude)
     if nbrs.verlet is None:
         return _make_again(nbrs, inputs)
     if not stays and nbrs.box_numbers is not None:
@@ -349,7 +361,7 @@ def _make_again_if_stale(nbrs: Kept, inputs: Inputs, stays: bool = False) -> Kep
         moved = call_late(by, (nbrs, inputs), jax.ShapeDtypeStruct((), bool))
     else:
         moved = _has_moved_too_far(nbrs, inputs)
-    fixed = {"box": box, "box_numbers": nbrs.box_numbers, "radii": radii, "batch": nbrs.batch, "exclude": nbrs.exclude}
+    fixed = {"box_numbers": nbrs.box_numbers, "radii": radii, "batch": nbrs.batch, "exclude": nbrs.exclude} | fields_of_box(box)
     # what stays is no state of the loop, so that XLA derives from it once what steps of a scan need
     left_out = dict.fromkeys(fixed)
     state = moved, _replace(nbrs, **left_out)

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jax import lax
+from jax import Array, lax
 from jax.core import Tracer
 
 from jfrnn import _engine as engine
@@ -205,11 +205,15 @@ def check_problem(asked: Asked) -> tuple["Problem", engine.Inputs]:
     options = engine.Options(keep, chosen, closed, 0.0 if radii is None else skin, images, static_reach, ordered)
     shape = {"own_queries": queries is not None, "masked": active is not None, "source_count": sources.shape[0]}
     problem = Problem(options, radius, skin, **shape, dim=sources.shape[1], dtype=dtype)
-    cutoff, known = problem.listed_within(radii), geometry.KnownBox()
+    cutoff = problem.listed_within(radii)
     if box is not None and images is not None:
-        box, known = geometry.known_box(box, images, dtype, cutoff.radius if isinstance(cutoff, geometry.Cutoff) else None)
-        box = geometry.box_of_list(box, images, reach)
-    return problem, engine.Inputs(sources, queries, active, box, cutoff, systems, excluded, known)
+        box = geometry.known_box(geometry.box_of_list(box, images, reach), images, dtype, radius_of(cutoff))
+    return problem, engine.Inputs(sources, queries, active, box, cutoff, systems, excluded)
+
+
+def radius_of(cutoff: geometry.Cutoff | geometry.Radii) -> np.floating | Array | None:
+    """Return the one cutoff of a search, None where cutoffs differ."""
+    return cutoff.radius if isinstance(cutoff, geometry.Cutoff) else None
 
 
 # --- its search -----------------------------------------------------------------------------------------------------------
@@ -262,8 +266,16 @@ def find_fields(
         codes = None if images is None else images.codes
         topology = make_topology(options, n, inputs.queries is not None, radii, rows.idx, codes, None, rows.order)
         reverse = topology.with_reverse()
-    fields = {"status": rows.status, "required": rows.required, "verlet": verlet, "box": lax.stop_gradient(inputs.box)}
+    fields = {"status": rows.status, "required": rows.required, "verlet": verlet, **fields_of_box(inputs.box)}
     fields |= {"images": images, "radii": radii, "batch": inputs.batch, "exclude": inputs.exclude, "reverse": reverse}
     if flat:
         return fields | {"senders": rows.idx, "receivers": rows.receivers, "offsets": offsets}
     return fields | {"idx": rows.idx, "count": rows.counts, "order": rows.order}
+
+
+def fields_of_box(box: geometry.Box | None) -> dict[str, Any]:
+    """Return what a list keeps of its box, and what is known of that, in memory of its own."""
+    box = lax.stop_gradient(box)
+    if isinstance(box, geometry.KnownBox):
+        return {"box": geometry.plain_box(box), "known": lax.optimization_barrier(box.found)}
+    return {"box": box, "known": None}

@@ -122,4 +122,4 @@ def first_verlet(
     if box is not None and kind is not None:
         ends = find_ends(positions, positions if queries is None else queries, box, kind, batch, False)
         positions, queries = ends.sources.points, None if queries is None else ends.rows.points
-    return Verlet(positions, queries, box, radii, jnp.int32(0))
+    return Verlet(positions, queries, geometry.plain_box(box), radii, jnp.int32(0))

@@ -54,13 +54,13 @@ class Searched:
 
     def reverse(self) -> "Searched":
         """Return the same pairs with i and j exchanged and shifts negated."""
-        sources, queries, active, box, cutoff, batch, exclude, known = self.inputs
+        sources, queries, active, box, cutoff, batch, exclude = self.inputs
         cutoff = cutoff.reverse() if isinstance(cutoff, Radii) else cutoff
         exclude = None if exclude is None else exclude.reverse()
         if queries is not None:
             sources, queries = queries, sources
             batch = batch if batch is None else batch.reverse()
-        return Searched(Inputs(sources, queries, active, box, cutoff, batch, exclude, known), self.options)
+        return Searched(Inputs(sources, queries, active, box, cutoff, batch, exclude), self.options)
 
     def fold(self, elements: int, visit: Visit, out: Tree) -> Tree:
         """Visit all pairs, as `fold_neighbors` does."""

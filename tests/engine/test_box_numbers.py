@@ -62,3 +62,24 @@ def test_a_list_that_went_to_another_platform_keeps_its_structure(monkeypatch):
     moved = jax.jit(lambda: jax.lax.scan(lambda kept, _: (kept.update(x, box), None), nbrs, None, length=2)[0])()
     assert jax.tree.structure(moved) == jax.tree.structure(nbrs)
     np.testing.assert_allclose(_energy(x, moved), _energy_of_search(x, box), rtol=1e-5)
+
+
+SKEWED = np.array([[3.0, 0.0, 0.0], [0.7, 4.0, 0.0], [-0.5, 0.9, 3.5]], np.float32)
+
+
+@pytest.mark.parametrize("make", [jfrnn.search, jfrnn.search_edges])
+@pytest.mark.parametrize("vectors", [LENGTHS, SKEWED], ids=["upright", "skewed"])
+def test_lists_keep_what_was_found_of_their_boxes(make, vectors):
+    x = jnp.asarray(np.random.default_rng(3).uniform(0, LENGTHS, (60, 3)), jnp.float32)
+    box, other = jfrnn.Box(vectors), jfrnn.Box(vectors * np.float32(1.03))
+    nbrs, there = (make(x, 1.0, skin=0.1, slack=2.0, box=each) for each in (box, other))
+    assert nbrs.known is not None
+    went = jax.jit(lambda x, nbrs, box: nbrs.update(x, box))(x, nbrs, other)
+    stayed = jax.jit(lambda x, nbrs: nbrs.update(x))(x, nbrs)
+    for kept, right in ((went, there), (nbrs.grow(x, other), there), (stayed, nbrs)):
+        np.testing.assert_allclose(kept.known, right.known, rtol=1e-5, atol=1e-6)
+        np.testing.assert_array_equal(kept.box.vectors, right.box.vectors)
+    # who donates a list leaves what later searches take
+    jax.jit(lambda nbrs: nbrs.update(x), donate_argnums=0)(make(x, 1.0, skin=0.1, slack=2.0, box=box))
+    np.testing.assert_array_equal(make(x, 1.0, skin=0.1, slack=2.0, box=box).known, nbrs.known)
+    assert jax.jit(lambda x, box: jfrnn.search(x, 1.0, box=box, capacity=40))(x, box).known is None
