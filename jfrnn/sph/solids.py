@@ -15,6 +15,7 @@ has them, and particles are looked at as their images nearest to the wall.
 """
 
 import math
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import jax
@@ -24,7 +25,7 @@ from jax import Array
 
 import jfrnn
 from jfrnn.cases import fluids
-from jfrnn.cases.fluids import FluidScene, Scene, Turning
+from jfrnn.cases.fluids import FluidScene, Scene, Solid, Turning
 from jfrnn.sph import sight
 from jfrnn.sph.errors import SceneError
 from jfrnn.sph.inside import find_inside
@@ -37,6 +38,7 @@ GAP = 0.2  # particle spacings: on a lattice, particles at a wall are half a spa
 _ROOM_AROUND = 2  # times the particles that are near a point in a fluid on a lattice
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
 _PLACES, _SHARES = (_NODES + 1) / 2, _WEIGHTS / 2
+_Mesh = Solid | jfrnn.TriangleList
 
 
 def begin(scene: FluidScene, x: Array, angle: Array | None = None) -> Beside | None:
@@ -51,7 +53,8 @@ def begin(scene: FluidScene, x: Array, angle: Array | None = None) -> Beside | N
     vertices, faces, cutoff = jnp.asarray(solid.vertices, x.dtype), jnp.asarray(solid.faces), _reach(scene)
     turning, goes_on = turning_of(scene, x.dtype), angle is not None
     angle = jnp.zeros((), x.dtype) if turning is not None and angle is None else angle
-    at = into_frame(_images(box_of(scene, x.dtype), x, vertices, turning), turning, angle)
+    placed = replace(solid, vertices=vertices, faces=faces)
+    at = into_frame(_images(box_of(scene, x.dtype), x, placed, turning), turning, angle)
     tri = jfrnn.search_triangles(at, vertices, faces, cutoff)
     signed = tri.signed_distance(at)
     if not signed.watertight:
@@ -91,7 +94,7 @@ def check_far(scene: FluidScene, x: Array, seen: Beside | None) -> None:
         return
     far, corners = ~np.asarray(seen.mask), np.asarray(scene.solid.vertices, np.float64)[scene.solid.faces]
     inside, turning = np.zeros(scene.n, bool), turning_of(scene, x.dtype)
-    at = _images(box_of(scene, x.dtype), x, seen.tri.vertices, turning)
+    at = _images(box_of(scene, x.dtype), x, seen.tri, turning)
     inside[far] = find_inside(np.asarray(at, np.float64)[far], _reach(scene), corners)
     _refuse(scene, inside)
 
@@ -118,7 +121,7 @@ def hidden(model: Model, s: State, beside: Beside, points: Array) -> tuple[Array
     """
     count, (n, dim) = len(points), s.x.shape
     room = math.ceil(_ROOM_AROUND * count * _neighbors(model.spacing, model.cutoff, dim))
-    x, points = (_images(model.box, each, beside.tri.vertices, model.turning) for each in (s.x, points))
+    x, points = (_images(model.box, each, beside.tri, model.turning) for each in (s.x, points))
     edges = jfrnn.search_edges(x, model.cutoff, queries=points, active=active(model, s), total=min(room, count * n))
     at, seen = (into_frame(each, model.turning, beside.angle) for each in (x, points))
     tri, rows = beside.tri, jnp.concatenate([at, jnp.broadcast_to(at[:1], seen.shape)])
@@ -132,7 +135,7 @@ def hidden(model: Model, s: State, beside: Beside, points: Array) -> tuple[Array
 def grow(model: Model, s: State, after: Beside) -> State:
     """Return a state that sees the wall with more room: with what turned out to be needed until `after`."""
     assert s.solid is not None, "there is a wall"
-    x = _images(model.box, s.x, s.solid.tri.vertices, model.turning)
+    x = _images(model.box, s.x, s.solid.tri, model.turning)
     at = into_frame(x, model.turning, s.solid.angle)
     seen = s.solid._replace(tri=after.tri.grow(at) if after.tri.overflow else s.solid.tri)
     if after.sight is not None and after.sight.overflow:
@@ -159,12 +162,15 @@ def check_images(scene: FluidScene) -> None:
     solid, box, reach_of = scene.solid, scene.periodic, _reach(scene)
     if solid is None or box is None:
         return
-    r = np.asarray(solid.vertices, np.float64) - np.asarray(_middle(np.asarray(solid.vertices), solid.turning))
-    if solid.turning is None:
+    turning, axis = solid.turning, np.zeros(scene.dim)
+    if turning is not None:
+        axis = axis if turning.axis is None else np.asarray(turning.axis, np.float64) / np.linalg.norm(turning.axis)
+        turning = replace(turning, center=np.asarray(turning.center, np.float64), axis=None if turning.axis is None else axis)
+    corners = np.asarray(solid.vertices, np.float64)[solid.faces]
+    r = corners.reshape(-1, scene.dim) - _middle(corners, turning)
+    if turning is None:
         farthest = np.abs(r).max(axis=0)
     else:
-        given = np.zeros(scene.dim) if solid.turning.axis is None else np.asarray(solid.turning.axis, np.float64)
-        axis = given / (np.linalg.norm(given) or 1)
         along = r @ axis
         around = np.linalg.norm(r - along[:, None] * axis, axis=1)
         farthest = (np.abs(along[:, None] * axis) + around[:, None] * np.sqrt(np.maximum(1 - axis**2, 0))).max(axis=0)
@@ -177,19 +183,25 @@ def check_images(scene: FluidScene) -> None:
             )
 
 
-def _middle(vertices: Any, turning: Turning[Any, Any] | None) -> Any:  # noqa: ANN401
-    """Return the point about which a solid lies, shape [d]: what it turns around, or the middle of its corners."""
-    return (vertices.min(axis=0) + vertices.max(axis=0)) / 2 if turning is None else turning.center
+def _middle(corners: Any, turning: Turning[Any, Any] | None) -> Any:  # noqa: ANN401
+    """Return the point about which a solid lies, shape [d]: the middle of its faces; of one that turns, that of its axis in it."""
+    corners = corners.reshape(-1, corners.shape[-1])
+    if turning is None:
+        return (corners.min(axis=0) + corners.max(axis=0)) / 2
+    if turning.axis is None:
+        return turning.center
+    along = ((corners - turning.center) * turning.axis).sum(axis=1)
+    return turning.center + (along.min() + along.max()) / 2 * turning.axis
 
 
-def _periods(box: jfrnn.Box | None, x: Array, vertices: Array, turning: Turning[Array, Array] | None) -> Array | None:
+def _periods(box: jfrnn.Box | None, x: Array, mesh: _Mesh, turning: Turning[Array, Array] | None) -> Array | None:
     """Return how far positions [n, d] are from their images nearest to a solid [m], shape [n, d]; None in open space."""
-    return None if box is None else periods_from(box, x, _middle(vertices, turning))
+    return None if box is None else periods_from(box, x, _middle(mesh.vertices[mesh.faces], turning))
 
 
-def _images(box: jfrnn.Box | None, x: Array, vertices: Array, turning: Turning[Array, Array] | None) -> Array:
+def _images(box: jfrnn.Box | None, x: Array, mesh: _Mesh, turning: Turning[Array, Array] | None) -> Array:
     """Return of positions [n, d] in a periodic box the images nearest to a solid [m]; in open space the positions."""
-    return _less(x, _periods(box, x, vertices, turning))
+    return _less(x, _periods(box, x, mesh, turning))
 
 
 def _less(x: Array, periods: Array | None) -> Array:
@@ -231,7 +243,7 @@ def keep_out(model: Model, s: State, x: Array, v: Array, dt: Array, rests: Array
         return s._replace(x=x, v=v)
     old, gap, turning = s.solid, GAP * model.spacing, model.turning
     angle = None if turning is None or old.angle is None else old.angle + dt * turning.rate
-    periods = _periods(model.box, x, old.tri.vertices, turning)
+    periods = _periods(model.box, x, old.tri, turning)
     before, ends = into_frame(_less(s.x, periods), turning, old.angle), into_frame(_less(x, periods), turning, angle)
     tri = old.tri.update(ends)
 
@@ -313,7 +325,7 @@ def _find_acting(model: Model, s: State, beside: Beside) -> _Acting:
     normal, turning = _turn(beside.normal, model.turning, beside.angle), model.turning
     if turning is None:
         return _Acting(area, weight, distance, normal, s.v, None)
-    x = _images(model.box, s.x, beside.tri.vertices, turning)
+    x = _images(model.box, s.x, beside.tri, turning)
     velocity = turning.rate * _across(x - distance[:, None] * normal - turning.center, turning)
     return _Acting(area, weight, distance, normal, s.v - velocity, turning.rate * _across(velocity, turning))
 
@@ -358,16 +370,18 @@ def load(model: Model, s: State, beside: Beside, rho: Array, p: Array) -> tuple[
     if model.turning is not None and physics.viscosity is not None and not physics.slip:
         spin = model.turning.rate * _across(wall.normal, model.turning)
         onto = onto - (2 * kinematic(physics.viscosity_form, physics.viscosity, rho) * wall.area)[:, None] * spin
-    x = _images(model.box, s.x, beside.tri.vertices, model.turning)
+    x = _images(model.box, s.x, beside.tri, model.turning)
     return onto, x - wall.distance[:, None] * wall.normal
 
 
 def rim_speed(model: Model, beside: Beside) -> Array:
     """Return the largest speed of the wall [m/s], shape []."""
-    corners = beside.tri.vertices
-    if model.turning is None:
-        return jnp.zeros((), corners.dtype)
-    return jnp.abs(model.turning.rate) * jnp.max(jnp.linalg.norm(corners - model.turning.center, axis=1))
+    tri, turning = beside.tri, model.turning
+    if turning is None:
+        return jnp.zeros((), tri.vertices.dtype)
+    r = tri.vertices[tri.faces].reshape(-1, tri.vertices.shape[1]) - turning.center
+    across = r if turning.axis is None else _across(r, turning)
+    return jnp.abs(turning.rate) * jnp.max(jnp.linalg.norm(across, axis=1))
 
 
 def clearance(scene: Scene, s: State) -> np.ndarray | None:
@@ -378,7 +392,7 @@ def clearance(scene: Scene, s: State) -> np.ndarray | None:
     if s.solid is None:
         return None
     turning = turning_of(scene, s.x.dtype)
-    x = _images(box_of(scene, s.x.dtype), s.x, s.solid.tri.vertices, turning)
+    x = _images(box_of(scene, s.x.dtype), s.x, s.solid.tri, turning)
     at = into_frame(x, turning, s.solid.angle)
     signed = s.solid.tri.update(at).signed_distance(at)
     free = np.asarray(signed.mask) if scene.wall is None else np.asarray(signed.mask) & ~scene.wall

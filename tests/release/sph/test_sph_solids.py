@@ -171,6 +171,26 @@ def test_a_solid_in_a_periodic_box_meets_every_image_of_the_fluid(turning):
     refuses(SceneError, rf"particle {len(x)} is not", make_state, deep)
 
 
+def test_any_point_of_the_axis_is_a_center():
+    """In a periodic box, too; and a corner that no face names is no part of the solid."""
+    vertices, faces = meshes.gear(6, 200, 1.0, 2.0, 0.5)
+    vertices, spacing, found = np.concatenate([vertices, np.full((1, 3), 50.0)]), 0.2, []
+    grid = np.stack(np.meshgrid(*[np.arange(-4.6, 4.6, spacing)] * 2, indexing="ij"), -1).reshape(-1, 2)
+    grid = grid[np.linalg.norm(grid, axis=1) > 4.1][::2]
+    x = np.concatenate([np.pad(grid, ((0, 0), (0, 1)), constant_values=z) for z in (-0.6, 0.1)])
+    box = fluids.Periodic((-5.0, -5.0, -1.7), (10.0, 10.0, 3.4), (True,) * 3)
+    for away, turns in ((0.0, 0), (37.0, 1)):
+        turning = fluids.Turning((0.0, 0.0, away), (0.0, 0.0, 3.0), 2.0)
+        scene = replace(beside(fluids.Solid(vertices, faces, turning), x + turns * np.array(box.lengths), spacing), periodic=box)
+        model, s = make_model(scene), make_state(scene)
+        assert float(solids.rim_speed(model, s.solid)) == pytest.approx(
+            2.0 * np.linalg.norm(vertices[faces][..., :2], axis=2).max()
+        )
+        found.append(solids.clearance(scene, s))
+    assert np.isfinite(found[0]).sum() > 20
+    np.testing.assert_allclose(found[1], found[0], atol=1e-6)
+
+
 def safe_state(scene):
     """Return a state of positions that may be anywhere."""
     far = replace(scene, positions=scene.positions + 100)
