@@ -72,12 +72,12 @@ def points_to_ask(corners: np.ndarray, reach: float) -> tuple[np.ndarray, np.nda
     if len(points) <= _MANY:
         return points, faces
     cells = np.floor(points / (reach / 8)).astype(np.int64)
-    ways = np.round(_normals(corners)).astype(np.int64)[faces]
+    ways = np.round(normals_of(corners)).astype(np.int64)[faces]
     first = np.unique(np.concatenate([cells, ways], axis=1), axis=0, return_index=True)[1]
     return points[first], faces[first]
 
 
-def _normals(corners: np.ndarray) -> np.ndarray:
+def normals_of(corners: np.ndarray) -> np.ndarray:
     """Return unit normals of faces, shape [f, d]; 0 where a face has none."""
     along = corners[:, 1:] - corners[:, :1]
     normals = np.cross(along[:, 0], along[:, 1]) if along.shape[2] == len("xyz") else along[:, 0, ::-1] * (1, -1)
@@ -91,7 +91,7 @@ def is_thin(corners: np.ndarray, asked: tuple[np.ndarray, np.ndarray], tri: jfrn
     Faces are given by their corners [length], shape [f, d, d]; points from `points_to_ask` are asked, near which `tri` lists them.
     """
     points, faces = asked
-    normals = _normals(corners)
+    normals = normals_of(corners)
     idx, used = np.asarray(tri.idx), np.arange(tri.capacity) < np.asarray(tri.count)[:, None]
     for block in np.array_split(np.arange(len(points)), -(-idx.size // _BLOCK)):
         rows, slots = np.nonzero(used[block])

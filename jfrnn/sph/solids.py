@@ -10,8 +10,8 @@ is between its ends; and where one is, the signed distance of the end tells its 
 that ends nearer than a gap is put one gap away; one that after that is not outside by half a gap stays where it was, and moves with
 the wall. Rounding is many orders smaller than the gap.
 
-In a periodic box the wall has images, of which no particle sees two: `check_images` refuses others. Triangles are where the scene
-has them, and particles are looked at as their images nearest to the wall.
+In a periodic box the wall has images, of which no particle sees two, or sees them as one that goes on: `check_images` refuses
+others. Triangles are where the scene has them, and particles are looked at as their images nearest to the wall.
 """
 
 import math
@@ -34,6 +34,7 @@ from jfrnn.sph.pairs import reach
 from jfrnn.sph.particles import Beside, Model, State, active, box_of, periods_from
 from jfrnn.sph.viscosity import kinematic
 
+_STRAIGHT = 1e-6  # component of a unit vector along an axis, up to which it stands across
 GAP = 0.2  # particle spacings: on a lattice, particles at a wall are half a spacing away
 _ROOM_AROUND = 2  # times the particles that are near a point in a fluid on a lattice
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
@@ -74,6 +75,11 @@ def begin(scene: FluidScene, x: Array, angle: Array | None = None) -> Beside | N
     seen = Beside(tri, angle, signed.mask, signed.distance, signed.normal)
     if not thin:
         return seen
+    if _narrow_axes(scene):
+        raise SceneError(
+            "solid is thinner than the kernel reaches, and may not run through a periodic box then: lines of sight end at its "
+            "borders. Take a thicker solid, or walls of dummies."
+        )
     neighbors = _neighbors(scene.spacing, cutoff, scene.dim)
     return _look_through(seen, at, sight.make_room(np.array([int(jnp.sum(tri.count > 0)), 0, 0]), neighbors, scene.n), neighbors)
 
@@ -158,29 +164,56 @@ def turning_of(scene: Scene, dtype: np.dtype | type) -> Turning[Array, Array] | 
 
 
 def check_images(scene: FluidScene) -> None:
-    """Refuse a periodic box in which a particle might be within reach of two images of the solid, however that has turned."""
+    """Refuse a periodic box in which a particle might be within reach of two images of the solid, however that has turned.
+
+    Of a solid that runs straight through the box, and beyond it farther than a particle sees, each image goes on in the next.
+    """
+    for k, least in _narrow_axes(scene).items():
+        if not _runs_through(scene, k):
+            assert scene.periodic is not None, "axes of a box are narrow"
+            raise SceneError(
+                f"periodic box must be {least:.6g} m wide along {'xyz'[k]} beside this solid, so that no particle is within reach "
+                f"of two images of it, got {scene.periodic.lengths[k]:.6g} m: take a larger box, walls of dummies, or a solid that "
+                f"runs straight through the box, at both ends at least {_reach(scene):.6g} m beyond it."
+            )
+
+
+def _narrow_axes(scene: FluidScene) -> dict[int, float]:
+    """Return the periodic axes along which there may be two images of the solid within reach, and the width [m] that parts them."""
     solid, box, reach_of = scene.solid, scene.periodic, _reach(scene)
     if solid is None or box is None:
-        return
-    turning, axis = solid.turning, np.zeros(scene.dim)
-    if turning is not None:
-        axis = axis if turning.axis is None else np.asarray(turning.axis, np.float64) / np.linalg.norm(turning.axis)
-        turning = replace(turning, center=np.asarray(turning.center, np.float64), axis=None if turning.axis is None else axis)
-    corners = np.asarray(solid.vertices, np.float64)[solid.faces]
-    r = corners.reshape(-1, scene.dim) - _middle(corners, turning)
-    if turning is None:
+        return {}
+    r, axis = _from_middle(solid)
+    r = r.reshape(-1, scene.dim)
+    if solid.turning is None:
         farthest = np.abs(r).max(axis=0)
     else:
         along = r @ axis
         around = np.linalg.norm(r - along[:, None] * axis, axis=1)
         farthest = (np.abs(along[:, None] * axis) + around[:, None] * np.sqrt(np.maximum(1 - axis**2, 0))).max(axis=0)
-    for k, name in enumerate("xyz"[: scene.dim]):
-        least = 2 * (float(farthest[k]) + reach_of)
-        if box.axes[k] and box.lengths[k] < least:
-            raise SceneError(
-                f"periodic box must be {least:.6g} m wide along {name} beside this solid, so that no particle is within reach of "
-                f"two images of it, got {box.lengths[k]:.6g} m: take a larger box, or walls of dummies."
-            )
+    least = 2 * (farthest + reach_of)
+    return {k: float(least[k]) for k in range(scene.dim) if box.axes[k] and box.lengths[k] < least[k]}
+
+
+def _runs_through(scene: FluidScene, k: int) -> bool:
+    """Say whether the solid is the same all along an axis of the periodic box, as far as a particle sees, and stays so."""
+    assert scene.solid is not None and scene.periodic is not None, "an axis is narrow"
+    r, axis = _from_middle(scene.solid)
+    far = scene.periodic.lengths[k] / 2 + _reach(scene)
+    low, high = r[..., k].min(axis=1), r[..., k].max(axis=1)
+    across = sight.normals_of(r[(low < far) & (high > -far)])[:, k]
+    turns_along = scene.solid.turning is None or abs(axis[k]) > 1 - _STRAIGHT
+    return turns_along and low.min() <= -far and high.max() >= far and bool(np.all(np.abs(across) < _STRAIGHT))
+
+
+def _from_middle(solid: Solid) -> tuple[np.ndarray, np.ndarray]:
+    """Return the corners of faces [m], shape [f, d, d], as seen from the middle of the solid, and the axis about which it turns."""
+    corners, turning = np.asarray(solid.vertices, np.float64)[solid.faces], solid.turning
+    axis = np.zeros(corners.shape[2])
+    if turning is not None:
+        axis = axis if turning.axis is None else np.asarray(turning.axis, np.float64) / np.linalg.norm(turning.axis)
+        turning = replace(turning, center=np.asarray(turning.center, np.float64), axis=None if turning.axis is None else axis)
+    return corners - _middle(corners, turning), axis
 
 
 def _middle(corners: Any, turning: Turning[Any, Any] | None) -> Any:  # noqa: ANN401

@@ -191,6 +191,58 @@ def test_any_point_of_the_axis_is_a_center():
     np.testing.assert_allclose(found[1], found[0], atol=1e-6)
 
 
+def bars(low, high, *heights):
+    """Return the corners and sides of rectangles from x = low to high, between pairs of heights."""
+    corners = np.concatenate([[[low, a], [high, a], [high, b], [low, b]] for a, b in heights])
+    return corners, np.arange(len(corners)).reshape(-1, 4)[:, [[0, 1], [1, 2], [2, 3], [3, 0]]].reshape(-1, 2).astype(np.int32)
+
+
+def test_walls_run_straight_through_a_periodic_box():
+    """A channel is the same for fluid anywhere along it; what is not straight, or is thin, or ends at the border, is refused."""
+    dx, box = 0.05, fluids.Periodic((0.0, 0.0), (0.5, 1.0), (True, False))
+    x = fluids.lattice((0, 0.3), (10, 8), dx)
+    jitter = np.random.default_rng(2).uniform(-0.2, 0.2, x.shape) * dx
+    wind = {"velocities": np.tile([1.0, 0.2], (len(x), 1)), "viscosity": 0.01}
+    channel, ends = fluids.Solid(*bars(-0.3, 0.8, (-0.1, 0.3), (0.7, 1.1))), []
+    for moved in (0.0, 1.21):
+        scene = replace(beside(channel, x + jitter + [moved, 0.0], dx, **wind), periodic=box)
+        model = make_model(scene)
+        s, _ = solver.advance(model, solver.begin(model, make_state(scene)), None, 120)
+        assert health.complaint(scene, s) is None
+        ends.append((np.asarray(s.x) - [moved, 0.0], np.asarray(s.v)))
+    np.testing.assert_allclose(ends[1][0], ends[0][0], atol=1e-6)
+    np.testing.assert_allclose(ends[1][1], ends[0][1], atol=1e-4)
+    assert np.ptp(ends[0][0][:, 0] - x[:, 0]) > 0.05  # walls drag
+
+    def with_solid(corners, sides, turning=None):
+        return replace(scene, solid=fluids.Solid(corners, sides, turning))
+
+    short = bars(0.0, 0.5, (-0.1, 0.3), (0.7, 1.1))
+    askew = channel.vertices + np.array([0.0, 0.01]) * (channel.vertices[:, :1] > 0)
+    refused = [short, (askew, channel.faces), (*short, fluids.Turning((0.0, 0.0), None, 1.0))]
+    for each in refused:
+        refuses(
+            SceneError,
+            "periodic box must be .* runs straight through the box, at both ends at least",
+            make_model,
+            with_solid(*each),
+        )
+    thin = with_solid(*bars(-0.3, 0.8, (0.2, 0.27)))
+    refuses(SceneError, "solid is thinner than the kernel reaches, and may not run through a periodic box", make_state, thin)
+
+
+@pytest.mark.parametrize(("axis", "fits"), [((0.0, 0.0, 2.0), True), ((0.0, 0.1, 1.0), False)])
+def test_shafts_run_through_a_periodic_box_along_their_axis(axis, fits):
+    shaft = fluids.Solid(*meshes.gear(6, 200, 1.0, 2.0, 0.5), fluids.Turning((0.0, 0.0, 5.0), axis, 1.0))
+    scene = replace(
+        beside(shaft, np.array([[4.8, 4.8, 0.0]]), 0.1), periodic=fluids.Periodic((-5.0,) * 3, (10.0, 10.0, 1.3), (True,) * 3)
+    )
+    if fits:
+        make_model(scene)
+    else:
+        refuses(SceneError, "periodic box must be .* m wide along z beside this solid", make_model, scene)
+
+
 def safe_state(scene):
     """Return a state of positions that may be anywhere."""
     far = replace(scene, positions=scene.positions + 100)
