@@ -78,7 +78,7 @@ class Lattice:
 class KnownBox(Box):
     """A box whose lattice was found before: XLA takes longer to compile that than all that a search in a box is besides.
 
-    `found` holds its numbers, and behind these what `jfrnn._geometry.wrapping` has found. Whose box this is, gets a plain one.
+    `found` holds its numbers, and behind these what `jfrnn._geometry.wrapping` has found. Lists and their users have the plain box.
     """
 
     found: Array

@@ -361,7 +361,8 @@ def _make_again_if_stale(nbrs: Kept, inputs: Inputs, stays: bool = False) -> Kep
         moved = call_late(by, (nbrs, inputs), jax.ShapeDtypeStruct((), bool))
     else:
         moved = _has_moved_too_far(nbrs, inputs)
-    fixed = {"box_numbers": nbrs.box_numbers, "radii": radii, "batch": nbrs.batch, "exclude": nbrs.exclude} | fields_of_box(box)
+    fixed = {"box_numbers": nbrs.box_numbers, "radii": radii, "batch": nbrs.batch, "exclude": nbrs.exclude}
+    fixed |= fields_of_box(box, nbrs.box_kind, inputs.cutoff)
     # what stays is no state of the loop, so that XLA derives from it once what steps of a scan need
     left_out = dict.fromkeys(fixed)
     state = moved, _replace(nbrs, **left_out)

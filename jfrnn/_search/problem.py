@@ -266,16 +266,24 @@ def find_fields(
         codes = None if images is None else images.codes
         topology = make_topology(options, n, inputs.queries is not None, radii, rows.idx, codes, None, rows.order)
         reverse = topology.with_reverse()
-    fields = {"status": rows.status, "required": rows.required, "verlet": verlet, **fields_of_box(inputs.box)}
+    fields = {
+        "status": rows.status,
+        "required": rows.required,
+        "verlet": verlet,
+        **fields_of_box(inputs.box, options.images, inputs.cutoff),
+    }
     fields |= {"images": images, "radii": radii, "batch": inputs.batch, "exclude": inputs.exclude, "reverse": reverse}
     if flat:
         return fields | {"senders": rows.idx, "receivers": rows.receivers, "offsets": offsets}
     return fields | {"idx": rows.idx, "count": rows.counts, "order": rows.order}
 
 
-def fields_of_box(box: geometry.Box | None) -> dict[str, Any]:
+def fields_of_box(
+    box: geometry.Box | None, images: geometry.Images | None, cutoff: geometry.Cutoff | geometry.Radii
+) -> dict[str, Any]:
     """Return what a list keeps of its box, and what is known of that, in memory of its own."""
-    box = lax.stop_gradient(box)
-    if isinstance(box, geometry.KnownBox):
-        return {"box": geometry.plain_box(box), "known": lax.optimization_barrier(box.found)}
-    return {"box": box, "known": None}
+    box, cutoff = lax.stop_gradient((box, cutoff))
+    if box is None or images is None or box.per_system:
+        return {"box": box, "known": None}
+    known = box if isinstance(box, geometry.KnownBox) else geometry.find_known(box, images, radius_of(cutoff))
+    return {"box": geometry.plain_box(box), "known": lax.optimization_barrier(known.found)}
