@@ -260,11 +260,18 @@ def known_box(box: Box, images: Images, dtype: np.dtype, radius: np.floating | A
 @functools.lru_cache(maxsize=64)
 def _known_box(structure: Internal, known: tuple, images: Images, dtype: np.dtype, radius: np.floating | None) -> KnownBox:
     box = jax.tree.unflatten(structure, [np.frombuffer(data, dtype).reshape(shape) for data, shape in known])
-    return find_known(box, images, radius)
+    return _find(box, images, radius)
+
+
+def find_known(box: Box | None, images: Images | None, radius: np.floating | Array | None) -> Box | None:
+    """Return a box with what is found of it, if that is not known yet; one per system, and none, as it is."""
+    if box is None or images is None or box.per_system or isinstance(box, KnownBox):
+        return box
+    return _find(box, images, radius)
 
 
 @functools.partial(compile_program, static_argnames="images")
-def find_known(box: Box, images: Images, radius: np.floating | None) -> KnownBox:
+def _find(box: Box, images: Images, radius: np.floating | Array | None) -> KnownBox:
     """Return a box of no system, with its lattice and, with a radius, what bounds the rounding errors of wrapping."""
     lattice = make_lattice(box, images, np.dtype(box.vectors.dtype))
     bounding = [] if radius is None else [x.astype(box.vectors.dtype).reshape(-1) for x in find_bounding(lattice, radius)]

@@ -318,8 +318,8 @@ def _update(
     nbrs, sources, queries, given, radii = lax.stop_gradient((nbrs, sources, queries, box, radii))
     stays, cutoff = given is None, nbrs.problem.listed_within(radii)
     box = nbrs._box_known if given is None else given
-    if given is not None and nbrs.known is not None and nbrs.box_kind is not None:
-        box = geometry.find_known(given, nbrs.box_kind, radius_of(cutoff))
+    if nbrs.known is not None:
+        box = geometry.find_known(box, nbrs.box_kind, radius_of(cutoff))
     inputs = Inputs(sources, queries, active, box, cutoff, nbrs.batch, nbrs.exclude)
     if nbrs.verlet is None:
         return _make_again(nbrs, inputs)
@@ -362,7 +362,7 @@ def _make_again_if_stale(nbrs: Kept, inputs: Inputs, stays: bool = False) -> Kep
     else:
         moved = _has_moved_too_far(nbrs, inputs)
     fixed = {"box_numbers": nbrs.box_numbers, "radii": radii, "batch": nbrs.batch, "exclude": nbrs.exclude}
-    fixed |= fields_of_box(box, nbrs.box_kind, inputs.cutoff)
+    fixed |= fields_of_box(box, moving=True)
     # what stays is no state of the loop, so that XLA derives from it once what steps of a scan need
     left_out = dict.fromkeys(fixed)
     state = moved, _replace(nbrs, **left_out)

@@ -52,8 +52,8 @@ class NeighborList(KeptSearch):
         exclude: Pairs that are excluded, as rows (`Exclusions`), or None; updates keep them.
         reverse: Where pairs stand the other way round (`Reverse`), if the list was made with `reverse=True`; updates find it anew
             whenever they rebuild the list.
-        known: What was found of the box, which programs that use the list need not find (`KnownBox`); None in open space, and
-            where each system has a box.
+        known: With a skin, what was found of the box, which programs that use the list need not find (`KnownBox`); None without,
+            in open space, and where each system has a box.
         box_numbers: With a skin, in a box, on CUDA: what kernels read of the box (`BoxNumbers`); None elsewhere.
         order: The particles as they followed each other in space when the list was last rebuilt, shape [n], int32, by which sums
             over a list on a GPU go; -1 where their numbers did so. None elsewhere, and for up to 4096 particles, queries, and

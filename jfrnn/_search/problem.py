@@ -253,6 +253,9 @@ def find_fields(
 
     As results of one program, they share no memory with the caller's arrays or each other, so either may be donated.
     """
+    if moving:  # others are made anew in each step, and what would be kept of a box is not worth finding
+        box = geometry.find_known(lax.stop_gradient(inputs.box), options.images, radius_of(inputs.cutoff))
+        inputs = inputs._replace(box=box)
     offsets, found = engine.list_flat(inputs, options, room) if flat else (None, engine.find_rows(inputs, options, room))
     rows, n, verlet, reverse = found.rows, len(inputs.sources), None, None
     images = None if found.images is None or found.turns is None else ImageCodes(found.images, found.turns[0], found.turns[1])
@@ -266,24 +269,15 @@ def find_fields(
         codes = None if images is None else images.codes
         topology = make_topology(options, n, inputs.queries is not None, radii, rows.idx, codes, None, rows.order)
         reverse = topology.with_reverse()
-    fields = {
-        "status": rows.status,
-        "required": rows.required,
-        "verlet": verlet,
-        **fields_of_box(inputs.box, options.images, inputs.cutoff),
-    }
+    fields = {"status": rows.status, "required": rows.required, "verlet": verlet, **fields_of_box(inputs.box, moving)}
     fields |= {"images": images, "radii": radii, "batch": inputs.batch, "exclude": inputs.exclude, "reverse": reverse}
     if flat:
         return fields | {"senders": rows.idx, "receivers": rows.receivers, "offsets": offsets}
     return fields | {"idx": rows.idx, "count": rows.counts, "order": rows.order}
 
 
-def fields_of_box(
-    box: geometry.Box | None, images: geometry.Images | None, cutoff: geometry.Cutoff | geometry.Radii
-) -> dict[str, Any]:
-    """Return what a list keeps of its box, and what is known of that, in memory of its own."""
-    box, cutoff = lax.stop_gradient((box, cutoff))
-    if box is None or images is None or box.per_system:
-        return {"box": box, "known": None}
-    known = box if isinstance(box, geometry.KnownBox) else geometry.find_known(box, images, radius_of(cutoff))
-    return {"box": geometry.plain_box(box), "known": lax.optimization_barrier(known.found)}
+def fields_of_box(box: geometry.Box | None, moving: bool) -> dict[str, Any]:
+    """Return what a list keeps of its box and, with a skin, of what is known of that, in memory of its own."""
+    box = lax.stop_gradient(box)
+    known = lax.optimization_barrier(box.found) if moving and isinstance(box, geometry.KnownBox) else None
+    return {"box": geometry.plain_box(box), "known": known}

@@ -84,4 +84,5 @@ def test_lists_keep_what_was_found_of_their_boxes(make, vectors):
     np.testing.assert_array_equal(make(x, 1.0, skin=0.1, slack=2.0, box=box).known, nbrs.known)
     traced = jax.jit(lambda x, box: jfrnn.search(x, 1.0, skin=0.1, box=box, capacity=40))(x, nbrs.box)
     assert jax.tree.structure(traced.box) == jax.tree.structure(nbrs.box)
+    assert make(x, 1.0, box=box).known is None
     np.testing.assert_allclose(traced.known, nbrs.known, rtol=1e-5, atol=1e-6)

@@ -162,7 +162,7 @@ def test_memory_of_images():
     assert nearest.images is None
     assert images.images.codes.dtype == np.uint8
     size = [sum(leaf.nbytes for leaf in jax.tree.leaves(nbrs)) for nbrs in (plain, nearest, images)]
-    assert size[1] - size[0] == sum(leaf.nbytes for leaf in jax.tree.leaves((nearest.box, nearest.known)))
+    assert size[1] - size[0] == sum(leaf.nbytes for leaf in jax.tree.leaves(nearest.box))
     assert size[2] - size[1] == images.idx.size + 4 * 64
 
 
