@@ -13,7 +13,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 from jax.core import ShapedArray
-from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
 from jfrnn import _tracing as tracing
@@ -37,7 +36,7 @@ def collect(y: Array, topology: Topology) -> Array:
     return bind(_collect_p, y, topology)
 
 
-def bind(primitive: Primitive, x: Array, given: tracing.Tree) -> Array:
+def bind(primitive: tracing.Primitive, x: Array, given: tracing.Tree) -> Array:
     """Apply a primitive of `define` to x and a pytree of arrays."""
     leaves, structure = jax.tree.flatten(given)
     axes = tracing.varying_axes((x, leaves))
@@ -73,13 +72,13 @@ def _collect(y: Array, topology: Topology) -> Array:
     return lax.fori_loop(0, groups, add_group, jnp.zeros((topology.sources, *y.shape[2:]), y.dtype))
 
 
-_gather_p, _collect_p = Primitive("jfrnn_gather"), Primitive("jfrnn_collect")
+_gather_p, _collect_p = tracing.Primitive("jfrnn_gather"), tracing.Primitive("jfrnn_collect")
 
 
 def define(
-    primitive: Primitive,
+    primitive: tracing.Primitive,
     work: Callable[[Array, Any], Array],
-    transposed: Primitive,
+    transposed: tracing.Primitive,
     shape_of: Callable[[tuple[int, ...], Any], tuple[int, ...]],
     plain: Callable[[Array, Any], Array] | None = None,
 ) -> None:

@@ -14,14 +14,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 from jax.custom_derivatives import SymbolicZero
-from jax.extend.core import Primitive
 
 from jfrnn._engine import KeptList, kept_distances, kept_slopes
 from jfrnn._geometry import Box, bring_near, translation
 from jfrnn._search.gathers import bind, collect, define, gather
 from jfrnn._search.geometry import kept_list, kept_shifts, norms, vectors_of
 from jfrnn._search.present import Present, Topology
-from jfrnn._tracing import call_apart, compile_program, on_platform, ruled, still
+from jfrnn._tracing import Primitive, call_apart, compile_program, on_platform, ruled, still
 
 _Lines = tuple[KeptList, Topology, Array]  # a list at present positions, and its distances, 0 where there is no pair
 

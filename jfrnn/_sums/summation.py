@@ -13,7 +13,6 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 from jax.core import ShapedArray
-from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
 from jfrnn import _tracing as tracing
@@ -24,7 +23,7 @@ from jfrnn._sums.terms import Groups, Term, choose, is_moving, join, tangent, tr
 
 Structure = Any  # the `PyTreeDef` of a relation, which type checkers do not accept as a type
 
-_pair_sum_p = Primitive("pair_sum")
+_pair_sum_p = tracing.Primitive("pair_sum")
 _pair_sum_p.multiple_results = True
 
 

@@ -20,10 +20,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jax.core import Tracer, eval_jaxpr
-from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, jaxpr_as_fun
 from jax.interpreters import partial_eval
 
-from jfrnn._tracing import Given, without_mesh
+from jfrnn._tracing import ClosedJaxpr, Given, Jaxpr, Literal, jaxpr_as_fun, without_mesh
 
 
 class Groups(NamedTuple):

@@ -19,12 +19,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from jax.core import Tracer
-from jax.extend.core import ClosedJaxpr, Literal
 
 from jfrnn._sums.factors import factor_out
 from jfrnn._sums.primitives import TABLE
 from jfrnn._sums.scalars import TYPES, Equation, NoTranslationError, Scalars, Spec, Values, hash_of
-from jfrnn._tracing import Aval, Given, Internal
+from jfrnn._tracing import Aval, ClosedJaxpr, Given, Internal, Literal
 
 MOST_ELEMENTS = 256  # most elements of an array
 

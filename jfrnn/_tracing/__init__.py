@@ -27,6 +27,7 @@ from jfrnn._tracing.arguments import (
     refuse_forks,
 )
 from jfrnn._tracing.flags import Packed, first_set, largest_of, pack_parts, packed_places, set_places
+from jfrnn._tracing.internals import ClosedJaxpr, Jaxpr, Literal, Primitive, jaxpr_as_fun
 from jfrnn._tracing.late import (
     call_apart,
     call_late,

@@ -22,6 +22,8 @@ from jax import Array
 from jax.core import Tracer
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
+from jfrnn._tracing.internals import Primitive, find_top_trace, set_current_trace
+
 Tree = Any  # a pytree of arrays, of any structure
 Given = Any  # an argument as the user passed it, before it is checked
 Aval = Any  # the type of an array in JAX's tracing: shape, dtype and the mesh axes over which it varies
@@ -138,7 +140,6 @@ def gather(x: Array) -> Array:
 @functools.cache
 def _one_of_batch() -> Internal:
     """Return a primitive that does nothing, but that `jax.vmap` refuses a batch that is sharded, whose parts JAX keeps apart."""
-    from jax.extend.core import Primitive
     from jax.interpreters import ad, batching, mlir
 
     def batch(args: Sequence[Array], dims: Sequence[int]) -> tuple[Array, int]:
@@ -167,10 +168,21 @@ def own_transfers() -> AbstractContextManager[object]:
     """
     refuse_forks()
     stack = contextlib.ExitStack()
+    stack.push(functools.partial(_end_traces, find_top_trace(())))
     for guard in (jax.transfer_guard_host_to_device, jax.transfer_guard_device_to_host, jax.transfer_guard_device_to_device):
         if getattr(jax.config, f"jax_{guard.__name__}") in ("disallow", "log"):
             stack.enter_context(guard("allow"))
     return stack
+
+
+def _end_traces(before: Internal, kind: type[BaseException] | None, *_: object) -> None:
+    """Make the trace the current one that was it before, where an exception ends a call.
+
+    JAX leaves a trace by Python code, and a handler of signals that raises at its beginning leaves the trace a current one, so that
+    every later operation of the thread would return a tracer.
+    """
+    if kind is not None and find_top_trace(()) is not before:
+        set_current_trace(before).__enter__()
 
 
 _is_forked = False

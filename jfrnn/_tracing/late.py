@@ -20,6 +20,7 @@ from jax import Array, lax
 from jax.core import ShapedArray, Tracer
 
 from jfrnn._tracing.arguments import Aval, Internal, Tree
+from jfrnn._tracing.internals import Primitive, jaxpr_as_fun
 
 # the one platform for which the function that is being traced will be lowered, None if that is not known
 _platform: contextvars.ContextVar[str | None] = contextvars.ContextVar("platform", default=None)
@@ -75,7 +76,6 @@ def lower_late(fn: Callable[..., Sequence[Array]]) -> Internal:
 
 @functools.cache
 def _late() -> Internal:
-    from jax.extend.core import Primitive
     from jax.interpreters import batching, mlir
 
     late = Primitive("jfrnn_late")
@@ -150,8 +150,6 @@ def call_apart(fn: Callable[..., Tree], *args: Tree) -> Tree:
     axes = varying_axes(args)
     if not axes:
         return fn(*args)
-    from jax.extend.core import jaxpr_as_fun
-
     leaves, structure = jax.tree.flatten(args)
     is_static = [isinstance(x, int) for x in leaves]
     arrays = [lax.stop_gradient(jnp.asarray(x)) for x, static in zip(leaves, is_static, strict=True) if not static]

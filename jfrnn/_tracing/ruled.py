@@ -15,6 +15,7 @@ from jax import Array, lax
 from jax.custom_derivatives import SymbolicZero
 
 from jfrnn._tracing.arguments import Internal, Tree
+from jfrnn._tracing.internals import Primitive
 from jfrnn._tracing.late import lower_late, result_aval, vary, varying_axes
 from jfrnn._tracing.programs import compile_program
 
@@ -37,7 +38,6 @@ def ruled(
         like: Returns shape and dtype of each result, given the same arguments, or their types.
         rule: Returns results and their tangents, given pytrees of arguments and of tangents; those that do not move are `still`.
     """
-    from jax.extend.core import Primitive
     from jax.interpreters import ad, batching, mlir
 
     primitive = Primitive(name)
