@@ -28,7 +28,7 @@ Lowered = Any  # the result of `lower` of a jitted function
 
 _Args = ParamSpec("_Args")
 _Result = TypeVar("_Result")
-_functions: "list[Program[..., Any]]" = []
+_functions: "dict[Program[..., Any], None]" = {}  # those that have been called
 _seen = 0  # number of programs when memory was last looked at
 _before: int | None = None  # what was resident when programs were last dropped, or first looked at [B]
 
@@ -41,12 +41,12 @@ class Program(Generic[_Args, _Result]):
 
     def __init__(self, function: Callable[_Args, _Result], **options: Option) -> None:
         self._function, self._options, self.calls = function, options, 0
-        self._jitted = self._compile_anew()
-        _functions.append(self)
         functools.update_wrapper(self, function)
 
-    def _compile_anew(self) -> Any:  # noqa: ANN401
-        """Return a jitted function of its own identity, with which all goes that JAX keeps of it, traces included."""
+    @functools.cached_property
+    def _jitted(self) -> Any:  # noqa: ANN401
+        """A jitted function of its own identity, with which all goes that JAX keeps of it, traces included."""
+        _functions[self] = None
         return jax.jit(functools.partial(self._function), **self._options)
 
     def __call__(self, *args: _Args.args, **kwargs: _Args.kwargs) -> _Result:
@@ -58,12 +58,14 @@ class Program(Generic[_Args, _Result]):
 
     def cache_size(self) -> int:
         """Return the number of programs of this function: one per combination of shapes and static arguments."""
-        return self._jitted._cache_size()
+        return self._jitted._cache_size() if self in _functions else 0
 
     def clear_cache(self) -> None:
         """Drop the programs of this function."""
-        self._jitted.clear_cache()
-        self._jitted, self.calls = self._compile_anew(), 0
+        _functions.pop(self, None)
+        jitted, self.calls = vars(self).pop("_jitted", None), 0
+        if jitted is not None:
+            jitted.clear_cache()
 
     def lower(self, *args: Tree, **kwargs: Tree) -> Lowered:
         """Lower like a jitted function; arguments may be shapes instead of arrays."""
@@ -75,7 +77,7 @@ compile_program = Program  # as functions are decorated with it
 
 def program_count() -> int:
     """Return the number of compiled programs that the library holds."""
-    return sum([function._jitted._cache_size() for function in _functions])  # a list takes less time than a generator
+    return sum([function._jitted._cache_size() for function in list(_functions)])  # a list takes less time than a generator
 
 
 def clear_programs(reused: bool = True) -> None:
@@ -83,7 +85,7 @@ def clear_programs(reused: bool = True) -> None:
 
     Without `reused`, those stay whose functions call each of their programs several times, as in a loop over steps.
     """
-    for function in _functions:
+    for function in list(_functions):
         if reused or function.calls < _USES * function.cache_size():
             function.clear_cache()
     with contextlib.suppress(OSError, AttributeError):  # other C libraries than glibc have no such function

@@ -56,11 +56,14 @@ def test_in_a_folder_that_can_only_be_read_kernels_are_compiled_elsewhere(read_o
 
 
 NOWHERE = """
+import logging
 import time
 import warnings
 import numpy as np
 import jfrnn
 from jfrnn.kernels import _compile
+
+logging.getLogger("jfrnn").setLevel(logging.ERROR)  # a slow machine would be told that kernels compile
 
 def make(*about, whole=_compile._make):
     time.sleep(0.3)  # so that threads of XLA, which have no caller that a warning could name, are there first
