@@ -53,7 +53,7 @@ def neighbour_list(
     given = {"atoms": atoms, "positions": positions, "cell": cell, "pbc": pbc, "numbers": numbers}
     found = neighbor_list(quantities, cutoff=cutoff, **given)
     parts = [x.astype(np.int32) if x.dtype.kind == "i" else x for x in (found if isinstance(found, tuple) else (found,))]
-    return tuple(parts) if len(parts) > 1 else parts[0]
+    return parts[0] if len(parts) == 1 else tuple(parts)
 
 
 def coordination(structure: Given, cutoff: Given) -> np.ndarray:

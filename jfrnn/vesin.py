@@ -6,6 +6,8 @@
 (array([[0, 1]], dtype=uint64),)
 """
 
+import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -40,11 +42,16 @@ class NeighborList:
             sorted: Not used: pairs always ascend by i.
             algorithm: Not used: "auto", "brute_force" or "cell_list".
             skin: Not used: each search is a new one.
-            n_threads: Not used.
+            n_threads: Not used; at least 0.
         """
-        if algorithm.lower() not in ("auto", "brute_force", "cell_list"):
+        self.cutoff, self.full_list, self.sorted = check_number(cutoff), bool(full_list), bool(sorted)
+        self.algorithm, self.skin, self.n_threads = algorithm.lower(), float(skin), int(n_threads)
+        if not 0 <= self.cutoff < math.inf:
+            raise ValueError(f"cutoff must be finite and at least 0, got {cutoff!r}.")
+        if self.n_threads < 0:
+            raise ValueError(f"n_threads must be at least 0, got {n_threads!r}.")
+        if self.algorithm not in ("auto", "brute_force", "cell_list"):
             raise ValueError(f"algorithm must be 'auto', 'brute_force' or 'cell_list', got {algorithm!r}.")
-        self.cutoff, self.full_list = check_number(cutoff), bool(full_list)
 
     def compute(
         self, points: Given, box: Given, periodic: Given, quantities: str = "ij", copy: bool = True
@@ -59,7 +66,7 @@ class NeighborList:
             copy: Not used: what is returned is the caller's.
 
         Returns:
-            A tuple of arrays: i, j and P uint64, S int32, D and d as points are, float32 or else float64.
+            A tuple of arrays: i, j and P uint64, S int32, D and d of the dtype of points if they are floats, or else float64.
 
         Raises:
             TypeError, ValueError: an argument is of the wrong kind, shape or range.
@@ -68,19 +75,26 @@ class NeighborList:
             raise TypeError(
                 f"points must be an array of NumPy, got {type(points).__name__}: pass points.cpu().numpy(), or use vesin."
             )
-        if not quantities or set(quantities) - set("ijPSDd"):
-            raise ValueError(f"quantities must be letters of 'ijPSDd', as in 'ijS', got {quantities!r}.")
-        names = "".join(dict.fromkeys("ijS" + quantities.replace("P", "")))
-        found = dict(zip(names, primitive_neighbor_list(names, periodic, box, points, self.cutoff), strict=True))
-        if not self.full_list:
-            used = half_of(found["i"], found["j"], found["S"])
-            found = {name: x[used] for name, x in found.items()}
-        found["P"] = np.stack([found["i"], found["j"]], axis=1)
-        real = np.float32 if getattr(points, "dtype", None) == np.float32 else np.float64
-        return tuple(found[name].astype(_DTYPES.get(name, real), copy=False) for name in quantities)
+        given = np.asarray(points).dtype
+        real = given if given.kind == "f" else np.dtype(np.float64)
+        return _arrays(
+            quantities, lambda names: primitive_neighbor_list(names, periodic, box, points, self.cutoff), real, self.full_list
+        )
 
 
 def ase_neighbor_list(quantities: str, *args: Given, **kwargs: Given) -> tuple[np.ndarray, ...]:
-    """Find pairs as `jfrnn.ase.neighbor_list` does, with the same arguments; the result is a tuple, of one letter, too."""
-    found = neighbor_list(quantities, *args, **kwargs)
-    return found if isinstance(found, tuple) else (found,)
+    """Find pairs as `jfrnn.ase.neighbor_list` does, with the same arguments; the result is as that of `NeighborList.compute`."""
+    return _arrays(quantities, lambda names: neighbor_list(names, *args, **kwargs), np.dtype(np.float64))
+
+
+def _arrays(quantities: Given, find: Callable[[str], Given], real: np.dtype, full_list: bool = True) -> tuple[np.ndarray, ...]:
+    """Return arrays as vesin has them, of pairs that are found by letters."""
+    if set(quantities) - set("ijPSDd"):
+        raise ValueError(f"quantities must be letters of 'ijPSDd', as in 'ijS', got {quantities!r}.")
+    names = "".join(dict.fromkeys(("i", "j", "S", *quantities))).replace("P", "")
+    found = dict(zip(names, find(names), strict=True))
+    if not full_list:
+        used = half_of(found["i"], found["j"], found["S"])
+        found = {name: x[used] for name, x in found.items()}
+    found["P"] = np.stack([found["i"], found["j"]], axis=1)
+    return tuple(found[name].astype(_DTYPES.get(name, real), copy=False) for name in quantities)

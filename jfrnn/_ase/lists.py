@@ -7,17 +7,18 @@ from typing import Any
 import numpy as np
 from ase import Atoms
 from ase import neighborlist as theirs
+from ase.cell import Cell
 
 from jfrnn._ase.pairs import half_of, neighbor_list, primitive_neighbor_list
 
 Given = Any  # what users pass: numbers, arrays, lists
 
 
-class PrimitiveNeighborList(theirs.NewPrimitiveNeighborList):
-    """`ase.neighborlist.NewPrimitiveNeighborList`, and what is read of `PrimitiveNeighborList`, with exact pairs.
+class NewPrimitiveNeighborList(theirs.NewPrimitiveNeighborList):
+    """`ase.neighborlist.NewPrimitiveNeighborList` with exact pairs.
 
     Arguments and methods are ASE's. Without `bothways`, of (i, j, S) and (j, i, -S) the one is listed whose S has a positive number
-    first, and of S = 0 the one with i <= j, as in `NewPrimitiveNeighborList`. With `sorted`, neighbors ascend by j, then S.
+    first, and of S = 0 the one with i <= j. With `sorted`, neighbors ascend by j, then S.
     """
 
     def build(self, pbc: Given, cell: Given, positions: Given, numbers: Given = None) -> None:
@@ -35,6 +36,10 @@ class PrimitiveNeighborList(theirs.NewPrimitiveNeighborList):
         self.first_neigh = np.searchsorted(self.pair_first, np.arange(len(positions) + 1))
         self.nupdates += 1
 
+    def get_neighbors(self, a: Given) -> tuple[np.ndarray, np.ndarray]:
+        """Return the neighbors of an atom, -1 being the last, and by how many lattice vectors they are moved."""
+        return super().get_neighbors(range(len(self.positions))[a])
+
     @property
     def neighbors(self) -> list[np.ndarray]:
         """Neighbors of each atom."""
@@ -46,7 +51,17 @@ class PrimitiveNeighborList(theirs.NewPrimitiveNeighborList):
         return np.split(self.offset_vec, self.first_neigh[1:-1])[: len(self.positions)]
 
 
-NewPrimitiveNeighborList = PrimitiveNeighborList
+class PrimitiveNeighborList(NewPrimitiveNeighborList, theirs.PrimitiveNeighborList):
+    """`ase.neighborlist.PrimitiveNeighborList` with the pairs of `NewPrimitiveNeighborList`."""
+
+    def update(self, pbc: Given, cell: Given, coordinates: Given) -> bool:
+        """Find the pairs anew where an atom moved by more than the skin; return whether that was so."""
+        return super().update(pbc, cell, coordinates)
+
+    def build(self, pbc: Given, cell: Given, coordinates: Given, numbers: Given = None) -> None:
+        """Find the pairs within cutoffs and skin."""
+        super().build(pbc, cell, coordinates, numbers)
+        self.cell, self.coordinates = Cell(self.cell), self.positions
 
 
 class NeighborList(theirs.NeighborList):
@@ -73,7 +88,7 @@ def use() -> contextlib.ExitStack:
     """
     undo = contextlib.ExitStack()
     pairs = [(theirs.neighbor_list, neighbor_list), (theirs.primitive_neighbor_list, primitive_neighbor_list)]
-    pairs += [(made, PrimitiveNeighborList) for made in (theirs.PrimitiveNeighborList, theirs.NewPrimitiveNeighborList)]
+    pairs += [(theirs.PrimitiveNeighborList, PrimitiveNeighborList), (theirs.NewPrimitiveNeighborList, NewPrimitiveNeighborList)]
     new = {id(old): ours for old, ours in pairs}
     for module in [module for name, module in sys.modules.items() if name.partition(".")[0] != "jfrnn"]:
         names = getattr(module, "__dict__", {})

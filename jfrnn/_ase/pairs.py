@@ -1,9 +1,9 @@
 """Pairs of one structure of atoms after another, from and to arrays of NumPy, with the arguments of ASE's functions."""
 
 import importlib
-import math
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -17,6 +17,7 @@ _SYMBOLS = (
     "Tc Ru Rh Pd Ag Cd In Sn Sb Te I Xe Cs Ba La Ce Pr Nd Pm Sm Eu Gd Tb Dy Ho Er Tm Yb Lu Hf Ta W Re Os Ir Pt Au Hg Tl "
     "Pb Bi Po At Rn Fr Ra Ac Th Pa U Np Pu Am Cm Bk Cf Es Fm Md No Lr Rf Db Sg Bh Hs Mt Ds Rg Cn Nh Fl Mc Lv Ts Og"
 )
+_FARTHEST = 1e145  # as good as infinite: coordinates are below 1e140
 _NUMBERS = {symbol: number for number, symbol in enumerate(_SYMBOLS.split())}
 
 
@@ -38,13 +39,14 @@ def neighbor_list(
     A structure is given as atoms, or as positions with a cell.
 
     Args:
-        quantities: Letters of what is returned, in this order: "i" and "j" the atoms of a pair, [pairs] int64; "S" by how many
-            lattice vectors j is moved, [pairs, 3] int64; "D" positions[j] - positions[i] + S @ cell [length], [pairs, 3] float64;
-            "d" its length, [pairs].
+        quantities: Letters of what is returned, in this order, or none: "i" and "j" the atoms of a pair, [pairs] int64; "S" by how
+            many lattice vectors j is moved, [pairs, 3] int64; "D" positions[j] - positions[i] + S @ cell [length], [pairs, 3]
+            float64; "d" its length, [pairs].
         a: `ase.Atoms`, or anything with `positions` [n, 3], `cell` [3, 3], `pbc` and `numbers` [n]. Vectors of axes that are not
             periodic may be anything, also 0. Atoms may lie outside the cell, which may have any skew or handedness.
         cutoff: A number [length]; or a dictionary of cutoffs of pairs of species, {("H", "O"): 1.2, (6, 6): 2.0}, in which absent
-            pairs have none; or radii of all atoms, an array [n]: pairs are then closer than the sum of their radii.
+            pairs have none; or radii of all atoms, an array [n]: pairs are then closer than the sum of their radii. Nothing is
+            closer than a negative cutoff; one that is infinite finds all pairs of an open structure.
         self_interaction: List each atom as its own neighbor, with S = 0, where a pair of its kind may be neighbors at all.
         max_nbins: Not used; it stands here as ASE has it.
         atoms: The name that matscipy has for a.
@@ -115,9 +117,10 @@ def primitive_neighbor_list(
     Raises:
         TypeError, ValueError: as `neighbor_list`.
     """
-    if not isinstance(quantities, str) or not quantities or set(quantities) - set("ijdDS"):
+    if not isinstance(quantities, str | list | tuple) or set(quantities) - set("ijdDS"):
         raise ValueError(f"quantities must be letters of 'ijdDS', as in 'ijS', got {quantities!r}.")
     x = _array("positions", positions, "real numbers of shape [n, 3]")
+    x = x.reshape(0, 3) if x.shape == (0,) else x
     vectors = _array("cell", cell, "real numbers of shape [3, 3]")
     vectors = np.diag(vectors) if vectors.ndim == 1 else vectors
     if x.ndim != 2 or x.shape[1] != 3 or vectors.shape != (3, 3):
@@ -127,9 +130,11 @@ def primitive_neighbor_list(
         )
     x = x @ vectors if use_scaled_positions else x
     cutoffs, rule, species = _cutoffs(cutoff, len(x), numbers)
-    structure = Structure(x, np.ascontiguousarray(vectors), _flags(pbc), cutoffs, rule, species)
+    periodic = _flags(pbc) * (len(x) > 0)  # where there are no atoms, any cell will do
+    structure = Structure(x, np.ascontiguousarray(vectors), periodic, np.minimum(cutoffs, _FARTHEST), rule, species)
     found = find_structure_pairs(structure, bool(self_interaction), quantities)
-    return tuple(found[name] for name in quantities) if len(quantities) > 1 else found[quantities]
+    arrays = tuple(found[name] for name in quantities)
+    return arrays[0] if len(arrays) == 1 else arrays
 
 
 def half_of(i: np.ndarray, j: np.ndarray, shifts: np.ndarray) -> np.ndarray:
@@ -143,14 +148,14 @@ def check_number(cutoff: Given, pair: Given = None) -> float:
     """Return one cutoff, of a pair of species if that is given.
 
     Raises:
-        TypeError, ValueError: it is no number, or negative or not finite.
+        TypeError, ValueError: it is no number.
     """
     of_pair = "" if pair is None else f" for {pair!r}"
     value = _array("cutoff", cutoff, f"a number [length]{of_pair}")
     if value.ndim:
         raise TypeError(f"cutoff must be a number [length]{of_pair}, got shape {list(value.shape)}.")
-    if not 0 <= value < math.inf:
-        raise ValueError(f"cutoff must be finite and at least 0, got {cutoff!r}{of_pair}.")
+    if np.isnan(value):
+        raise ValueError(f"cutoff must be a number [length], got {cutoff!r}{of_pair}.")
     return float(value)
 
 
@@ -166,7 +171,7 @@ def _array(name: str, value: Given, what: str) -> np.ndarray:
 
 def _flags(pbc: Given) -> np.ndarray:
     flags = np.asarray(pbc)
-    if flags.shape not in ((), (3,)) or flags.dtype.kind not in "biu":
+    if flags.shape not in ((), (3,)) or flags.dtype.kind not in "biuf":
         raise ValueError(f"pbc must be one bool or three, got {pbc!r}.")
     return np.ascontiguousarray(np.broadcast_to(flags.astype(bool), 3), np.int32)
 
@@ -189,26 +194,26 @@ def _cutoffs(cutoff: Given, n: int, numbers: Given) -> tuple[np.ndarray, str, np
         raise ValueError(
             f"cutoff must be a number, a dictionary, or radii of shape [{n}], one per atom, got shape {list(values.shape)}."
         )
-    if len(bad := np.flatnonzero(~((values >= 0) & (values < math.inf)))):
-        raise ValueError(f"cutoff must be finite and at least 0, got {values[bad[0]]:g} for atom {bad[0]}.")
+    if len(bad := np.flatnonzero(np.isnan(values))):
+        raise ValueError(f"cutoff must hold numbers, got {values[bad[0]]:g} for atom {bad[0]}.")
     return values, "radii", None
 
 
 def _table(cutoff: Mapping, n: int, numbers: Given) -> tuple[np.ndarray, str, np.ndarray]:
     given = np.asarray(numbers) if numbers is not None else np.zeros(0)
-    if given.shape != (n,) or (n and given.dtype.kind not in "iu"):
+    if given.shape != (n,) or (n and given.dtype.kind not in "iuf"):
         raise ValueError(
             f"a dictionary of cutoffs needs numbers, integers of shape [{n}], the species of each atom, got {numbers!r}."
         )
     kinds, species = np.unique(given, return_inverse=True)
-    places = {int(kind): place for place, kind in enumerate(kinds.tolist())}
+    places = {kind: place for place, kind in enumerate(kinds.tolist())}
     table = np.zeros((len(kinds), len(kinds)))
     for pair, value in cutoff.items():
-        known = isinstance(pair, tuple) and len(pair) == 2 and all(isinstance(x, int | np.integer) or x in _NUMBERS for x in pair)
-        if not known:
+        names = tuple(pair) if isinstance(pair, Iterable) else ()
+        if len(names) != 2 or not all(isinstance(x, Real) or x in _NUMBERS for x in names):
             raise ValueError(f"keys of cutoff must be pairs of symbols or numbers, as in ('C', 'H') or (6, 1), got {pair!r}.")
         number = check_number(value, pair)
-        a, b = (places.get(_NUMBERS[x] if x in _NUMBERS else int(x), -1) for x in pair)
+        a, b = (places.get(_NUMBERS.get(x, x), -1) for x in names)
         if min(a, b) >= 0:
             table[a, b] = table[b, a] = number
     return table, "table", np.ascontiguousarray(species, np.int32)

@@ -10,7 +10,7 @@ from jax import Array
 from jax.core import Tracer
 
 from jfrnn._geometry import Box
-from jfrnn._jax_md.spaces import Dense, OrderedSparse, Sparse, check_format, custom_partition
+from jfrnn._jax_md.spaces import Dense, OrderedSparse, Sparse, check_format, custom_partition, floats_of
 from jfrnn._search import NeighborList as Kept
 from jfrnn._search import flatten, search
 
@@ -109,7 +109,7 @@ def neighbor_list_multi_image(  # noqa: D417 (four arguments share a line)
         return NeighborListMultiImage(*fields, None, form, room, update, overflow, kept=kept)  # pyright: ignore
 
     def allocate(position: Array, extra_capacity: int = 0, box: Given = box, **given: Given) -> NeighborListMultiImage:
-        position = jnp.asarray(position)
+        position = floats_of(position)
         n, dim = position.shape
         if dim not in (2, 3) or position.dtype in (np.float16, jnp.bfloat16):
             if _theirs is None:
@@ -133,7 +133,7 @@ def neighbor_list_multi_image(  # noqa: D417 (four arguments share a line)
     def update(position: Array, neighbors: NeighborListMultiImage, box: Given = None, **given: Given) -> NeighborListMultiImage:
         if not isinstance(neighbors, NeighborListMultiImage):  # jax-md's own
             return neighbors.update(position, **{} if box is None else {"box": box})
-        position, room, old = jnp.asarray(position), neighbors.max_occupancy, neighbors.kept
+        position, room, old = floats_of(position), neighbors.max_occupancy, neighbors.kept
         others = neighbors.update_fn is not update and getattr(neighbors.update_fn, "settings", None) != settings
         if others and neighbors.format != form:
             raise ValueError(f"update() of format {form.name} was given a list of format {neighbors.format.name}: allocate anew.")

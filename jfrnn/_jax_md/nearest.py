@@ -12,7 +12,7 @@ from jax import Array, lax
 from jax.core import Tracer
 
 from jfrnn._geometry import Box, Status
-from jfrnn._jax_md.spaces import Dense, OrderedSparse, Space, Sparse, check_format, partition, space_of
+from jfrnn._jax_md.spaces import Dense, OrderedSparse, Space, Sparse, check_format, floats_of, partition, space_of
 from jfrnn._search import NeighborList as Kept
 from jfrnn._search import flatten, search
 
@@ -68,7 +68,7 @@ def neighbor_list(
     Args:
         displacement_or_metric: `f(Ra, Rb, **kwargs)`, a vector or a distance [length]; None: the nearest image in `box`, exactly.
         box: Edge length, edge lengths [d], or a matrix [d, d] whose columns are the lattice vectors [length].
-        r_cutoff: Distance within which pairs interact [length].
+        r_cutoff: Distance within which pairs interact [length]. If it or dr_threshold is traced, the functions refuse to be called.
         dr_threshold: Skin [length]: the list holds pairs within r_cutoff + dr_threshold, and is rebuilt after half of that motion.
         capacity_multiplier: Factor on the room that the pairs take when the list is allocated.
         disable_cell_list: Measure all pairs by the function.
@@ -86,7 +86,10 @@ def neighbor_list(
         ValueError, TypeError: an argument is of the wrong kind, shape or range. `allocate` also raises what `NeighborList.check`
             of jfrnn would, as for positions that are not finite.
     """
-    form, cutoff, skin = check_format(format), float(r_cutoff), float(dr_threshold)
+    form = check_format(format)
+    if isinstance(r_cutoff, Tracer) or isinstance(dr_threshold, Tracer):  # as where an energy is differentiated by its lengths
+        return partition.NeighborListFns(_refuse, _refuse)
+    cutoff, skin = float(r_cutoff), float(dr_threshold)
     reach = cutoff + skin
     if not (cutoff > 0 and 0 <= skin < np.inf):
         raise ValueError(f"r_cutoff must be above 0, and dr_threshold finite and not below 0, got {cutoff} and {skin}.")
@@ -180,7 +183,7 @@ def neighbor_list(
         return dataclasses.replace(neighbors, **made, occupancy=held, measured_in=nowhere)
 
     def allocate(position: Array, extra_capacity: int = 0, **kwargs: Given) -> NeighborList:
-        position = jnp.asarray(position)
+        position = floats_of(position)
         if isinstance(position, Tracer):
             raise TypeError(
                 "allocate() chooses shapes from positions and cannot run inside jax.jit: call it outside, update inside."
@@ -210,11 +213,12 @@ def neighbor_list(
         return NeighborList(idx, position, error, *fixed, kept=kept, **chosen)
 
     def update(position: Array, neighbors: NeighborList, **kwargs: Given) -> NeighborList:
+        position = floats_of(position)
         if "box" in kwargs and not (fractional_coordinates or disable_cell_list):
             raise ValueError("a list takes box= only with fractional_coordinates=True or disable_cell_list=True.")
         if neighbors.update_fn is not update and not _alike(getattr(neighbors.update_fn, "settings", None), settings):
-            return find_anew(jnp.asarray(position), neighbors, kwargs)
-        position, kept, room, exact = jnp.asarray(position), neighbors.kept, neighbors.max_occupancy, neighbors.exact
+            return find_anew(position, neighbors, kwargs)
+        kept, room, exact = neighbors.kept, neighbors.max_occupancy, neighbors.exact
         dim, present = position.shape[1], None
         if fractional_coordinates and kept is not None:
             own = own_space(dim) if exact else None
@@ -248,6 +252,13 @@ def neighbor_list(
     settings = functions, box, cutoff, skin, form, disable_cell_list, mask_self, fractional_coordinates
     update.settings = settings  # pyright: ignore[reportFunctionMemberAccess]
     return partition.NeighborListFns(allocate, update)
+
+
+def _refuse(*_: Given, **__: Given) -> Any:  # noqa: ANN401
+    raise TypeError(
+        "r_cutoff and dr_threshold must be known to allocate or update a list, and were traced: make its functions outside of "
+        "jax.jit and jax.grad, or call the list's own update()."
+    )
 
 
 def _alike(some: Any, others: tuple) -> bool:  # noqa: ANN401

@@ -5,7 +5,9 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+from jax import Array
 from jax.core import Tracer
 
 try:
@@ -44,6 +46,12 @@ def check_format(given: Any) -> Any:  # noqa: ANN401
     if name not in members:
         raise ValueError(f"format must be a member of NeighborListFormat, as Dense, Sparse or OrderedSparse, got {given!r}.")
     return members[name]
+
+
+def floats_of(position: Any) -> Array:  # noqa: ANN401
+    """Return positions as an array of JAX, whole numbers among them as floats."""
+    position = jnp.asarray(position)
+    return position.astype(float) if jnp.issubdtype(position.dtype, jnp.integer) else position
 
 
 def space_of(function: Callable[..., Any], dim: int) -> Space | None:

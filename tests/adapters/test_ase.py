@@ -157,13 +157,15 @@ BAD = {
     "cell must be real numbers": {"cell": "cubic"},
     "pbc must be one bool or three": {"pbc": (True, False)},
     r"cutoff must be a number, a dictionary, or radii of shape \[2\]": {"cutoff": np.ones(3)},
-    "cutoff must be finite and at least 0": {"cutoff": -1.0},
-    "cutoff must be finite and at least 0, got -1 for atom 1": {"cutoff": [1.0, -1.0]},
-    "cutoff must be finite and at least 0, got inf for": {"cutoff": {(1, 1): np.inf}, "numbers": [1, 1]},
+    r"cutoff must be a number \[length\], got nan": {"cutoff": np.nan},
+    "cutoff must hold numbers, got nan for atom 1": {"cutoff": [1.0, np.nan]},
+    "or take a smaller cutoff": {"cutoff": {(1, 1): np.inf}, "numbers": [1, 1]},
+    "positions must be finite": {"positions": np.array([[0, 0, 0], [0, 0, np.nan]])},
     r"cutoff must be a number \[length\], a dictionary of numbers, or radii of all atoms, got str": {"cutoff": "3"},
     r"cutoff must be a number \[length\] for \(1, 1\), got str": {"cutoff": {(1, 1): "2"}, "numbers": [1, 1]},
     r"cutoff must be a number \[length\] for \('H', 6\), got shape \[1\]": {"cutoff": {("H", 6): [2.0]}, "numbers": [1, 1]},
     "keys of cutoff must be pairs of symbols or numbers": {"cutoff": {("H", "Q"): 1.0}, "numbers": [1, 1]},
+    "keys of cutoff must be pairs .* got 6": {"cutoff": {6: 1.0}, "numbers": [1, 1]},
     "cutoff must not be a defaultdict of 2.0 with other values": {"cutoff": collections.defaultdict(lambda: 2.0, {(1, 1): 1.0})},
     "a dictionary of cutoffs needs numbers": {"cutoff": {(1, 1): 1.0}},
     "linearly independent": {"cell": np.array([[1.0, 0, 0], [2.0, 0, 0], [0, 0, 1.0]])},
@@ -175,6 +177,47 @@ BAD = {
 def test_bad_input_says_what_is_wrong(message):
     given = {"quantities": "ij", "pbc": True, "cell": np.eye(3), "positions": np.zeros((2, 3)), "cutoff": 0.5} | BAD[message]
     refuses((ValueError, TypeError), message, primitive_neighbor_list, **given)
+
+
+def test_cutoffs_below_zero_and_without_end():
+    """Nothing is closer than a negative cutoff; radii may be negative where their sums are not; in open space all may be pairs."""
+    cell, pbc = CELLS["left-handed"]
+    rng = np.random.default_rng(9)
+    x, numbers = np.round(8 * rng.random((24, 3))) / 4, np.repeat([1, 6], 12)
+    for cutoff in (-1.0, -np.inf, np.full(24, -0.25), {(1, 6): -1.0, (1, 1): -np.inf}):
+        assert len(primitive_neighbor_list("i", pbc, cell, x, cutoff, numbers, self_interaction=True)) == 0
+    radii = rng.choice([-0.3, -0.25, 0.1, 0.5, 0.9, 1.0], 24)
+    expected = pairs_within(x, cell, pbc, radii[:, None] + radii)
+    assert as_set(*primitive_neighbor_list("ijS", pbc, cell, x, radii)) == expected != set()
+    one, *others = np.inf, *np.zeros(23)
+    for cutoff, size in ((one, 24 * 23), ({(1, 1): one}, 12 * 11), ([one, *others], 2 * 23), ([one, -one, *others[1:]], 2 * 22)):
+        assert len(primitive_neighbor_list("i", False, cell, x, cutoff, numbers)) == size
+
+
+def test_what_else_ase_takes():
+    """Letters one by one or none, any cell around no atoms, numbers for truth values, and pairs of species in other containers."""
+    x, cell, numbers = np.array([[0.0, 0, 0], [1.0, 0, 0]]), np.eye(3) * 3, np.array([1.0, 6.0])
+    given = True, cell, x, 1.5
+    assert primitive_neighbor_list("", *given) == primitive_neighbor_list((), *given) == ()
+    i, j = primitive_neighbor_list(["i", "j"], *given)
+    assert (i.tolist(), primitive_neighbor_list(("j",), *given).tolist()) == ([0, 1], j.tolist())
+    assert [part.shape for part in primitive_neighbor_list("iS", True, np.zeros((3, 3)), [], 2.0)] == [(0,), (0, 3)]
+    i, shifts = primitive_neighbor_list("iS", [1.0, 0.0, 0.0], cell, x, 3.5)
+    assert set(shifts[:, 0].tolist()) == {-1, 0, 1}
+    assert not shifts[:, 1:].any()
+    for pair in (("H", 6), "HC", frozenset("HC"), [1.0, "C"], np.array([6, 1])):
+        assert primitive_neighbor_list("i", True, cell, x, Pairs(pair), numbers).tolist() == [0, 1]
+
+
+class Pairs(dict):
+    """One pair with a cutoff of 1.5, whether it can be a key of a dictionary or not."""
+
+    def __init__(self, pair):
+        super().__init__()
+        self.pair = pair
+
+    def items(self):
+        return [(self.pair, 1.5)]
 
 
 def test_what_is_no_structure_is_refused():
@@ -241,6 +284,26 @@ def test_classes_of_ase(bothways):
     assert ours.update(atoms)
 
 
+def test_primitive_lists_of_ase():
+    """Either class has the arguments and attributes of its own; atoms are counted from the end, too."""
+    theirs, build = pytest.importorskip("ase.neighborlist"), pytest.importorskip("ase.build")
+    atoms = build.bulk("Cu", cubic=True)
+    old, other = (module.PrimitiveNeighborList([1.4] * 4, bothways=True) for module in (jfrnn.ase, theirs))
+    new = jfrnn.ase.NewPrimitiveNeighborList([1.4] * 4, bothways=True)
+    assert isinstance(old, theirs.PrimitiveNeighborList)
+    assert not isinstance(new, theirs.PrimitiveNeighborList)
+    for made in (old, other):
+        assert made.update(pbc=atoms.pbc, cell=atoms.cell, coordinates=atoms.positions)
+        assert not made.update(atoms.pbc, atoms.cell, atoms.positions + 0.01)
+        np.testing.assert_array_equal(made.coordinates, atoms.positions)
+        assert made.cell.volume == atoms.cell.volume
+    assert new.update(pbc=atoms.pbc, cell=atoms.cell, positions=atoms.positions, numbers=atoms.numbers)
+    for made in (old, new):
+        for a in (-1, np.int64(-4), 2):
+            assert len(made.get_neighbors(a)[0]) == len(other.get_neighbors(a)[0]) == 13
+        refuses(IndexError, "out of range", made.get_neighbors, 4)
+
+
 def test_other_names_of_ase():
     theirs, build = pytest.importorskip("ase.neighborlist"), pytest.importorskip("ase.build")
     water = build.molecule("H2O")
@@ -286,7 +349,7 @@ def test_calculators_of_ase(name):
     with jfrnn.ase.use():
         assert theirs.neighbor_list is jfrnn.ase.neighbor_list
         found = run()
-        assert name == "morse" or isinstance(make.nl.nl, jfrnn.ase.PrimitiveNeighborList)
+        assert name == "morse" or isinstance(make.nl.nl, jfrnn.ase.NewPrimitiveNeighborList)
     assert theirs.neighbor_list is function
     assert theirs.NeighborList([1.0]).nl.__class__ is theirs.PrimitiveNeighborList
     for ours, others in zip(found, before):
@@ -311,8 +374,21 @@ def test_forms_of_matscipy_and_vesin():
     assert both | {(b, a, -x, -y, -z) for a, b, x, y, z in both} == whole
     single = jfrnn.vesin.NeighborList(cutoff=2.0, full_list=True).compute(x.astype(np.float32), cell, True, "D")
     assert [part.dtype.name for part in single] == ["float32"]
+    for dtype, name in ((np.float16, "float16"), (np.longdouble, np.dtype(np.longdouble).name), (np.int32, "float64")):
+        made = jfrnn.vesin.NeighborList(cutoff=2.0, full_list=True).compute(x.astype(dtype), cell, [1.0, 1.0, 1.0], "Dd")
+        assert [part.dtype.name for part in made] == [name, name]
     (alone,) = jfrnn.vesin.ase_neighbor_list("i", atoms, 2.0)
     np.testing.assert_array_equal(alone, i)
+    together, moved = jfrnn.vesin.ase_neighbor_list("PS", atoms, 2.0)
+    np.testing.assert_array_equal(together, np.stack([i, j], axis=1))
+    assert (alone.dtype, together.dtype, moved.dtype) == (np.uint64, np.uint64, np.int32)
+    made = jfrnn.vesin.NeighborList(cutoff=2, full_list=1, algorithm="Cell_List", skin=1)
+    assert vars(made) | {"cutoff": 2.0, "full_list": True, "sorted": False, "algorithm": "cell_list", "skin": 1.0} == vars(made)
+    assert made.n_threads == 0
+    assert made.compute(x, cell, True, "") == jfrnn.vesin.ase_neighbor_list("", atoms, 2.0) == ()
+    assert jfrnn.matscipy.neighbour_list("", atoms, 2.0) == ()
+    for bad in ({"cutoff": -1.0}, {"cutoff": np.inf}, {"cutoff": 2.0, "n_threads": -1}):
+        refuses(ValueError, "at least 0", jfrnn.vesin.NeighborList, full_list=True, **bad)
     with pytest.raises(ValueError, match="quantities must be letters of 'ijPSDd'"):
         jfrnn.vesin.NeighborList(cutoff=2.0, full_list=True).compute(x, cell, True, "x")
     refuses(TypeError, r"cutoff must be a number \[length\], got list", jfrnn.vesin.NeighborList, cutoff=["a"], full_list=True)

@@ -174,8 +174,31 @@ def test_boxes_that_change():
     for cutoff, skin in ((np.nan, 0.0), (-1.0, 0.0), (CUTOFF, -0.1), (CUTOFF, np.inf)):
         refuses(ValueError, "r_cutoff must be above 0, and dr_threshold finite", jax_md.neighbor_list, free, 3.0, cutoff, skin)
     refuses(
-        TypeError, "position must hold floats, got int", jax_md.neighbor_list(free, 3.0, CUTOFF).allocate, np.zeros((4, 3), int)
+        TypeError, "position must hold floats, got bool", jax_md.neighbor_list(free, 3.0, CUTOFF).allocate, np.zeros((4, 3), bool)
     )
+
+
+def test_whole_numbers_are_positions():
+    x = np.random.default_rng(3).integers(0, 5, (20, 3))
+    fns = jax_md.neighbor_list(free, 5.0, 1.5, SKIN, 4.0)
+    images = jax_md.neighbor_list_multi_image(None, 5.0 * jnp.eye(3), 1.5, fractional_coordinates=False)
+    for made in (fns.allocate(x), jax.jit(fns.update)(x, fns.allocate(x.astype(float)))):
+        assert pairs_of(made.idx, 20, jax_md.Dense) == pairs_of(fns.allocate(x.astype(float)).idx, 20, jax_md.Dense) != set()
+    np.testing.assert_array_equal(images.allocate(x).senders, images.allocate(x.astype(float)).senders)
+
+
+def test_an_energy_is_differentiated_by_its_cutoff():
+    """As jax-md's energies make functions of lists of what is differentiated, and do not call them."""
+    x = points(False, 20)
+    nbrs = jax_md.neighbor_list(None, LENGTHS, CUTOFF).allocate(x)
+
+    def energy(scale):
+        fns = jax_md.neighbor_list(None, LENGTHS, CUTOFF * scale)
+        refuses(TypeError, "r_cutoff and dr_threshold must be known", fns.allocate, x)
+        refuses(TypeError, "r_cutoff and dr_threshold must be known", fns.update, x, nbrs)
+        return scale**2 * (nbrs.update(x).idx < 20).sum()
+
+    assert jax.grad(energy)(1.0) == 2 * (nbrs.idx < 20).sum()
 
 
 @pytest.mark.parametrize("measured", [False, True])

@@ -200,11 +200,12 @@ struct Structure : StructureArguments {
     // Brings atoms into the cell, and bounds what rounding does to their coordinates, fractions and distances.
     JFRNN_APART int wrap() {
         double most_turns = 0, size[3] = {0, 0, 0};
+        for (long long k = 0; k < 3ll * n; ++k)
+            if (!Bits::finite(positions[k]))
+                return NOT_FINITE;
         for (int i = 0; i < n; ++i) {
             const real* x = positions + 3ll * i;
             for (int k = 0; k < 3; ++k) {
-                if (!Bits::finite(x[k]))
-                    return NOT_FINITE;
                 if (fabs(x[k]) > FARTHEST)
                     return TOO_FAR;
                 double f = x[0] * transform[0][k] + x[1] * transform[1][k] + x[2] * transform[2][k];
