@@ -2,6 +2,7 @@
 
 import contextlib
 import sys
+import types
 from typing import Any
 
 import numpy as np
@@ -80,8 +81,8 @@ def use() -> contextlib.ExitStack:
     """Let ASE's calculators, and all that has been imported, search by jfrnn.
 
     From this call on, `ase.neighborlist` has our functions and classes under its own names, also where they have been imported from
-    there by now, and a new `NeighborList` of ASE takes our pairs. Lists that exist stay as they are. The call may stand alone; what
-    it returns undoes it, at the end of a `with` or by `close()`.
+    there by now, and where they are defaults of arguments, as in a new `NeighborList` of ASE. Lists and calculators that exist stay
+    as they are. The call may stand alone; what it returns undoes it, at the end of a `with` or by `close()`.
 
     Returns:
         A context manager.
@@ -95,7 +96,10 @@ def use() -> contextlib.ExitStack:
         for name in [name for name, value in names.items() if id(value) in new]:
             undo.callback(names.__setitem__, name, names[name])
             names[name] = new[id(names[name])]
-    made = theirs.NeighborList.__init__
-    undo.callback(setattr, made, "__defaults__", made.__defaults__)
-    made.__defaults__ = (*(made.__defaults__ or ())[:-1], PrimitiveNeighborList)
+        kinds = [names, *(vars(value) for value in names.values() if issubclass(type(value), type))]
+        for function in [value for kind in kinds for value in kind.values() if type(value) is types.FunctionType]:
+            old = function.__defaults__ or ()
+            if any(id(value) in new for value in old):
+                undo.callback(setattr, function, "__defaults__", old)
+                function.__defaults__ = tuple(new.get(id(value), value) for value in old)
     return undo
