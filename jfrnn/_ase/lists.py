@@ -55,11 +55,11 @@ class NewPrimitiveNeighborList(theirs.NewPrimitiveNeighborList):
 class PrimitiveNeighborList(NewPrimitiveNeighborList, theirs.PrimitiveNeighborList):
     """`ase.neighborlist.PrimitiveNeighborList` with the pairs of `NewPrimitiveNeighborList`."""
 
-    def update(self, pbc: Given, cell: Given, coordinates: Given) -> bool:
+    def update(self, pbc: Given, cell: Given, coordinates: Given) -> bool:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Find the pairs anew where an atom moved by more than the skin; return whether that was so."""
         return super().update(pbc, cell, coordinates)
 
-    def build(self, pbc: Given, cell: Given, coordinates: Given, numbers: Given = None) -> None:
+    def build(self, pbc: Given, cell: Given, coordinates: Given, numbers: Given = None) -> None:  # pyright: ignore
         """Find the pairs within cutoffs and skin."""
         super().build(pbc, cell, coordinates, numbers)
         self.cell, self.coordinates = Cell(self.cell), self.positions
