@@ -209,6 +209,7 @@ def what_is_missing_anywhere_is_told():
     back = distributed.migrate(crowded.replace(positions=particles.positions))
     assert jfrnn.Status.SHARD_OVERFLOW in jfrnn.Status(int(back.status))
     assert int(back.required.particles) == 16
+    raises(RuntimeError, f"halo {[*back.sizes.halo]}, hops {[*back.sizes.hops]}: grow()", back.check)
     x[1] = [5.0, 3.0]  # from the region of the first shard into that of the third
     far = particles.replace(positions=jnp.asarray(x)[ids])
     halo = distributed.halo(far)

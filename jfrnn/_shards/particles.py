@@ -146,11 +146,12 @@ class Particles:
     def check(self) -> None:
         """Raise what the status bits report; wait for the devices. Not inside jit: there, read `overflow`.
 
+        What positions hold is not looked at: `check()` of a list tells whether they are finite and fit the box.
+
         Raises:
             RuntimeError: a buffer overflowed; the message gives the size needed, and `grow` provides it.
-            ValueError: positions hold NaN or infinity, or do not fit the box.
         """
-        check(self, ", ".join(f"{name} {size}" for name, size in self.sizes._asdict().items()))
+        check(self, ", ".join(f"{name} {np.asarray(size).tolist()}" for name, size in self.sizes._asdict().items()))
 
     def grow(self, *seen: Met, slack: float = 1.25) -> "Particles":
         """Return the same particles with the buffer sizes that `seen` requires. Not inside jit: sizes are shapes.

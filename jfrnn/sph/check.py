@@ -43,6 +43,8 @@ def check_scene(scene: Scene) -> None:
         raise SceneError(f"bounds must be finite, for they are what pictures show, got {scene.bounds}.")
     if scene.periodic is not None:
         _check_periodic(scene.periodic, scene.dim)
+        if scene.tank is not None and np.isfinite([scene.tank.lower, scene.tank.upper])[:, list(scene.periodic.axes)].any():
+            raise SceneError(f"tank must be infinite along axes that are periodic, {scene.periodic.axes}, got {scene.tank}.")
     if scene.solid is not None:
         _check_solid(scene.solid, scene.dim)
     check_physics(scene.physics)
@@ -52,7 +54,7 @@ def check_scene(scene: Scene) -> None:
 
 def _check_kinds(scene: FluidScene | GasScene) -> None:
     """Refuse fields that are of another kind than they should be, such as a pair of corners instead of a `Tank`."""
-    if not isinstance(scene.name, str) or not scene.name or "/" in scene.name:
+    if not isinstance(scene.name, str) or scene.name in ("", ".", "..") or "/" in scene.name:
         raise SceneError(f"name must be a text without '/', which files are called by, got {_kind(scene.name)}.")
     kinds: dict[str, type] = {"tank": fluids.Tank, "bounds": fluids.Tank, "sealed": fluids.Tank, "outflow": fluids.Tank}
     for name, kind in (kinds | {"periodic": fluids.Periodic, "solid": fluids.Solid}).items():

@@ -1,6 +1,7 @@
 """The command line: `python -m jfrnn.sph run SCENE`, and `list`, which says what scenes there are and what each can be told."""
 
 import argparse
+import os
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -23,12 +24,15 @@ class _Parser(argparse.ArgumentParser):
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command; return its exit code: 0, 2 after a mistake, 130 where it was stopped."""
+    """Run a command; return its exit code: 0, 1 where nobody reads what it says, 2 after a mistake, 130 where it was stopped."""
     try:
         given = _make_parser().parse_args(arguments)
-        print(given.act(given))
+        print(given.act(given), flush=True)
     except (SceneError, DivergedError) as error:
         return _refuse(str(error))
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or Python writes what is left, and complains, at its end
+        return 1
     except OSError as error:
         where = f"{error.filename}: " if error.filename else ""
         return _refuse(f"{where}{error.strerror or error}")

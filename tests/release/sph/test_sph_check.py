@@ -45,6 +45,11 @@ def turning(center=(0.0, 0.0), rate=1.0):
         ({"bounds": fluids.Tank(None, None)}, "bounds.lower must have a number for each of 2 axes, got NoneType None"),
         ({"physics": {"density": 1000.0}}, "physics must be a Physics, got dict"),
         ({"name": "a/b"}, "name must be a text without '/', which files are called by, got str 'a/b'"),
+        ({"name": ".."}, "name must be a text without '/', which files are called by, got str '..'"),
+        (
+            {"tank": BOX, "periodic": fluids.Periodic((0.0, 0.0), (1.0, 1.0), (False, True))},
+            r"tank must be infinite along axes that are periodic, \(False, True\), got Tank",
+        ),
         ({"guided": -1.0}, "guided must be a finite number above 0, got -1.0"),
         ({"sealed": fluids.Tank((1.0, 0.0), (0.0, 1.0))}, "sealed must reach from a lower to an upper corner"),
         ({"periodic": fluids.Periodic((0.0, 0.0), (1.0, 1.0), (True,))}, "periodic.axes must say of each of 2 axes"),

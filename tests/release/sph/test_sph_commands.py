@@ -4,11 +4,15 @@ import contextlib
 import functools
 import inspect
 import io
+import os
 import re
+import subprocess
+import sys
 
 import commanded
 import numpy as np
 import pytest
+from places import ROOT
 from started import run_python
 
 from jfrnn.sph import ranges, settings, snapshots
@@ -193,6 +197,14 @@ def test_a_process_says_its_mistakes():
     done = run_python("-m", "jfrnn.sph", "run", "one", "--frames", 0, ends=2)
     assert done.stdout == ""
     assert done.stderr.startswith("error: --frames: got '0'; ") and done.stderr.endswith("(see python -m jfrnn.sph run --help)\n")
+
+
+def test_a_process_ends_quietly_where_nobody_reads_what_it_says():
+    reader, writer = os.pipe()
+    os.close(reader)
+    done = subprocess.run([sys.executable, "-m", "jfrnn.sph", "list"], stdout=writer, stderr=subprocess.PIPE, cwd=ROOT, check=False)
+    os.close(writer)
+    assert (done.returncode, done.stderr) == (1, b"")
 
 
 def test_help_keeps_what_stands_in_brackets(capsys):
