@@ -188,7 +188,7 @@ class Box:
         """
         if isinstance(self.vectors, Tracer) or isinstance(self.flags, Tracer):
             raise TypeError("images_for() reads the vectors of a box, and these are traced: ask outside of jax.jit.")
-        if isinstance(cutoff, Tracer | bool) or not isinstance(cutoff, int | float | np.number):
+        if isinstance(cutoff, Tracer | bool) or not isinstance(cutoff, int | float | np.floating | np.integer):
             raise TypeError(f"cutoff must be a number, got {type(cutoff).__name__}.")
         if not 0 < cutoff < math.inf:
             raise ValueError(f"cutoff must be positive and finite, got {cutoff}.")

@@ -17,6 +17,7 @@ from jfrnn._geometry.cutoffs import RANGE_OF, RULES, SUM, TABLE, Radii, is_radiu
 from jfrnn._tracing import Given, Tree, as_array, as_dtype, gather, make_on_host, on_device, refuse_forks
 
 _MOST_POINTS = 2**31 - 32
+_MOST_SLOTS_OF_ROW = 2**31 - 1
 _MOST_KINDS = 2**12  # places in a table of their cutoffs are whole floats, too
 
 
@@ -26,6 +27,19 @@ def refuse_rounding(name: str) -> None:
         raise TypeError(
             f"{name} are float64, but JAX's 64-bit mode is off and would round them to float32 in silence: call "
             f'jax.config.update("jax_enable_x64", True) at start-up, or pass {name}.astype(np.float32).'
+        )
+
+
+def refuse_wrapping(name: str, integers: np.ndarray) -> None:
+    """Raise for integers of 64 bits that do not fit into 32 where JAX has no others."""
+    kind = integers.dtype
+    if kind.kind not in "iu" or kind.itemsize < 8 or not integers.size or jax.config.read("jax_enable_x64"):
+        return
+    least, most, room = int(integers.min()), int(integers.max()), np.iinfo(f"{kind.kind}4")
+    if not room.min <= least <= most <= room.max:
+        raise ValueError(
+            f"{name} holds {kind} from {least} to {most}, but JAX's 64-bit mode is off and would wrap them around in silence: call "
+            f'jax.config.update("jax_enable_x64", True) at start-up, or pass integers that {room.dtype} can hold.'
         )
 
 
@@ -108,8 +122,10 @@ def check_cutoff(cutoff: Given, dtype: np.dtype) -> float:
         )
     if np.ndim(cutoff) != 0:
         raise ValueError(f"cutoff must be one number, got an array of shape {list(np.shape(cutoff))}.")
-    if isinstance(cutoff, bool) or not (isinstance(cutoff, Real) or hasattr(cutoff, "dtype")):
-        raise TypeError(f"cutoff must be a number, got {type(cutoff).__name__}.")
+    kind = getattr(cutoff, "dtype", None)
+    is_real = isinstance(cutoff, Real) if kind is None else any(jnp.issubdtype(kind, x) for x in (np.floating, np.integer))
+    if isinstance(cutoff, bool) or not is_real:
+        raise TypeError(f"cutoff must be a number, got {type(cutoff).__name__ if kind is None else kind}.")
     value = float(cutoff)
     if not (math.isfinite(value) and value > 0):
         raise ValueError(f"cutoff must be positive and finite, got {value}.")
@@ -233,7 +249,7 @@ def largest_known(radii: Radii) -> float | None:
 
 def check_skin(skin: object, cutoff: float, dtype: np.dtype) -> float:
     """Return a static skin, rounded to the dtype of the positions; 0 means no skin."""
-    if isinstance(skin, Tracer | bool) or not isinstance(skin, int | float | np.number):
+    if isinstance(skin, Tracer | bool) or not isinstance(skin, int | float | np.floating | np.integer):
         raise TypeError(f"skin must be a number known while tracing, got {_describe(skin)}.")
     value, (least, most) = float(dtype.type(skin)), RANGE_OF[dtype]
     low, high = 2 * least, most - cutoff
@@ -328,6 +344,8 @@ def check_values(name: str, values: Tree, size: int, what: str, more: str = "") 
             raise TypeError(f"{full} must be an array with a row per {what}, got {type(leaf).__name__}.")
         if tuple(leaf.shape[:1]) != (size,):
             raise ValueError(f"{full} must have shape [{size}, ...], one row per {what}, got {list(leaf.shape)}{more}.")
+        if isinstance(leaf, np.ndarray):
+            refuse_wrapping(full, leaf)
         return leaf
 
     return jax.tree_util.tree_map_with_path(check, values)
@@ -349,12 +367,17 @@ def check_capacity(capacity: object) -> int:
         )
     if capacity < 1:
         raise ValueError(f"capacity must be at least 1, got {capacity}.")
+    if capacity > _MOST_SLOTS_OF_ROW:
+        raise ValueError(
+            f"capacity must be at most {_MOST_SLOTS_OF_ROW}, as many as int32 numbers in a row, got {capacity}: pass less, "
+            "or a smaller slack."
+        )
     return int(capacity)
 
 
 def check_slack(slack: object) -> float:
     """Return a static factor of at least 1."""
-    if isinstance(slack, bool) or not isinstance(slack, int | float | np.number):
+    if isinstance(slack, bool) or not isinstance(slack, int | float | np.floating | np.integer):
         raise TypeError(f"slack must be a number of at least 1, known while tracing, got {_describe(slack)}.")
     if not (math.isfinite(slack) and slack >= 1):
         raise ValueError(f"slack must be finite and at least 1 (the capacity is slack times the longest row), got {slack}.")

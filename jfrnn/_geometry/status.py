@@ -1,6 +1,7 @@
 """Status bits: each names a problem that only the data reveal; and the error for lists that are too small.
 
-What stands in place of numbers that may be wrong, so that they are not taken for right, is NaN, or the smallest integer.
+What stands in place of numbers that may be wrong, so that they are not taken for right, is NaN, or the smallest integer (where
+that is 0, the largest).
 """
 
 import enum
@@ -177,13 +178,16 @@ def good_rows(points: Array, active: Array | None, whole: Array | None) -> Array
 
 
 def mark_rows(x: Array, good: Array) -> Array:
-    """Replace rows that are not good by NaN (integers: the smallest one); their derivatives become NaN too.
+    """Replace rows that are not good by NaN (integers: the smallest one, or of unsigned ones, where that is 0, the largest).
+
+    Derivatives of these rows become NaN too.
 
     `good` [rows] says it of each row, or [] of all.
     """
     if jnp.issubdtype(x.dtype, jnp.floating):
         return x * _spread(jnp.where(good, 1, jnp.nan).astype(x.dtype), x.ndim)
-    return jnp.where(_spread(good, x.ndim), x, jnp.iinfo(x.dtype).min)
+    limits = jnp.iinfo(x.dtype)
+    return jnp.where(_spread(good, x.ndim), x, limits.min or limits.max)
 
 
 def _spread(good: Array, ndim: int) -> Array:

@@ -74,7 +74,7 @@ def pair_sum(  # noqa: D417 (nine arguments share a line)
 
     Returns:
         A pytree as fn returns it, leaves [m, ...]. Invalid rows (NaN or infinite coordinates; inside jit all rows, if pairs may be
-        missing) are NaN, integers the smallest of their dtype; rows without neighbors are 0.
+        missing) are NaN, integers the smallest of their dtype (unsigned: the largest); rows without neighbors are 0.
 
     Raises:
         NeighborOverflowError, ValueError: outside jit, pairs may be missing.

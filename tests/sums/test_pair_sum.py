@@ -868,6 +868,20 @@ def test_errors(error, match, call):
     refuses(error, match, call)
 
 
+def test_integers_that_do_not_fit_are_refused():
+    """Of 64 bits, where JAX has 32: they wrapped around, 2^40 to 0."""
+    with jax.enable_x64(False):
+        for numbers in (np.full(4, 2**40), np.full(4, -(2**40)), np.full(4, 2**40, np.uint64)):
+            refuses(ValueError, r"values\['id'\] holds u?int64 from .* wrap them around", pair_sum, {"id": numbers})
+
+
+def test_unsigned_integers_are_marked_by_the_largest():
+    """The smallest is 0, which a sum may be."""
+    x = np.array([[0, 0], [1, 0], [np.nan, 0]], X.dtype)
+    sums = jfrnn.pair_sum(lambda r, i, j: j, x, 2.0, np.ones(3, np.uint8))
+    assert sums.dtype == np.uint8 and sums.tolist() == [1, 1, 255]
+
+
 @pytest.mark.parametrize("backend", ["warp", "jax"])
 @pytest.mark.parametrize(
     ("cutoff", "box"), [(0.9, jfrnn.Box([1.0, 1.0], images=0)), (np.array([0.5, -1.0, 0.5], np.float32), None)]
