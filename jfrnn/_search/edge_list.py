@@ -171,7 +171,3 @@ class EdgeList(KeptSearch):
         by_sender = one_each(self.senders, self.source_count, native, self.reverse)
         by_receiver = one_each(self.receivers, self._row_count, native, edges_of_rows(self.offsets, self.total))
         return self._present(by_sender, self.offsets[-1], sources, rows, box, decided), by_receiver
-
-    def _check_single(self) -> None:
-        if self.senders.ndim != 1:
-            raise ValueError(f"take one list at a time, got senders of shape {list(self.senders.shape)}: index the batch first.")

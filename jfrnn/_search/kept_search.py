@@ -252,6 +252,13 @@ class KeptSearch(KeptOptions):
         made.check()
         return made
 
+    def _check_single(self) -> None:
+        if self.status.ndim:
+            raise ValueError(
+                f"take one list at a time, got lists of shape {list(self.status.shape)}, as jax.vmap returns them: call this under "
+                "jax.vmap, too, or index the batch first, jax.tree.map(lambda leaf: leaf[0], nbrs)."
+            )
+
     def _check_active(self, active: Flags | None, sources: Array) -> Array | None:
         if self.masked != (active is not None):
             state = "with active: pass active=" if self.masked else "without active: leave active out"
@@ -288,6 +295,7 @@ class KeptSearch(KeptOptions):
         self, positions: Points, queries: Points | None, box: geometry.Box | None
     ) -> tuple[Array, Array, geometry.Box | None]:
         """Return the present positions of sources and rows, as lengths, and the present box, after checking that they fit."""
+        self._check_single()
         problem, rows = self.problem, None
         sources = geometry.check_again("positions", positions, problem.dtype, problem.dim, problem.source_count, self.status)
         if problem.own_queries != (queries is not None):

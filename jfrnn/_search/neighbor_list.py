@@ -429,9 +429,5 @@ class NeighborList(KeptSearch):
             used = np.arange(self.capacity) < count[:, None] if near is None else np.asarray(near)
         return used.sum(1), idx[used]
 
-    def _check_single(self) -> None:
-        if self.idx.ndim != 2:
-            raise ValueError(f"exports take one list at a time, got idx of shape {list(self.idx.shape)}: index the batch first.")
-
     def _pairs_held(self) -> int:
         return int(np.sum(jax.device_get(self.count), dtype=np.int64))

@@ -117,6 +117,8 @@ def test_refusals(points):
         jax.jit(lambda x: jfrnn.search(x, 0.4, capacity=40).check())(points)
     batch = jax.vmap(lambda x: jfrnn.search(x, 0.4, capacity=40))(points[None])
     refuses(ValueError, "index the batch first", batch.pairs)
+    for call in (batch.vectors, batch.distances, batch.shifts, batch.update, batch.grow):
+        refuses(ValueError, "index the batch first", call, points)
 
 
 ASKED = {
