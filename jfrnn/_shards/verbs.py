@@ -127,8 +127,8 @@ def pair_sum(  # noqa: D417 (three arguments share a line, and two another)
 
     Returns:
         A pytree as fn returns it, leaves [N, ...], 0 in unused rows. If a halo overflowed, or list or halo belong to other rows,
-        all floats are NaN and all integers the smallest of their dtype; `migrate` reports the size needed. So are rows of particles
-        that are not finite, and those of shards on which rows of the list overflowed.
+        all floats are NaN and all integers the smallest of their dtype (unsigned: the largest); `migrate` reports the size needed.
+        So are rows of particles that are not finite, and those of shards on which rows of the list overflowed.
 
     Raises:
         RuntimeError: outside jit, `neighbors` overflowed, as its `check` says.
