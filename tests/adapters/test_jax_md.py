@@ -216,7 +216,7 @@ def test_positions_that_are_not_finite_are_told(measured):
     assert fns.update(lost, nbrs).did_buffer_overflow
 
 
-@pytest.mark.parametrize("form", FORMATS)
+@pytest.mark.parametrize("form", [FORMATS[0], *map(slow, FORMATS[1:])])
 def test_lists_of_other_functions(form):
     """A list that was made for another box, cutoff or displacement has the pairs of the functions that update it."""
     x = points(False)
@@ -289,7 +289,7 @@ def cubic(a, b, xp=jnp):  # no Euclidean distance: pairs are as far apart as the
     return xp.minimum(away, EDGE)
 
 
-@pytest.mark.parametrize("displacement", [sheared, longer, bumped, cubic])
+@pytest.mark.parametrize("displacement", [longer, cubic, slow(sheared), slow(bumped)])
 def test_the_function_chooses(displacement):
     """Also where it is nearly, but not everywhere, the nearest image in `box`; and about particles with themselves."""
     x = np.random.default_rng(4).random((400, 3)) * EDGE

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from checked import slow
 
 import jfrnn
 from jfrnn._engine import renew_warp
@@ -22,7 +23,7 @@ def _energy(x, nbrs, cutoff=None, **more):
 
 
 @pytest.mark.usefixtures("as_on_cuda")
-@pytest.mark.parametrize("periodic", [True, (True, False, True)])
+@pytest.mark.parametrize("periodic", [True, slow((True, False, True))])
 def test_sums_and_forces_are_those_of_a_search_in_the_present_box(periodic):
     x = jnp.asarray(np.random.default_rng(0).uniform(0, LENGTHS, (200, 3)), jnp.float32)
     box, other = (jfrnn.Box(LENGTHS * scale, periodic=periodic) for scale in (np.float32(1), np.float32(1.04)))
@@ -30,13 +31,14 @@ def test_sums_and_forces_are_those_of_a_search_in_the_present_box(periodic):
     assert nbrs.box_numbers is not None
     scanned = jax.jit(lambda x, nbrs: jax.lax.scan(lambda kept, _: (kept.update(x), None), nbrs, None, length=2)[0])(x, nbrs)
     changed = jax.jit(lambda x, nbrs, box: nbrs.update(x, box))(x, nbrs, other)
+    force_of, shorter_of = jax.jit(jax.value_and_grad(_energy)), jax.jit(lambda x, kept: _energy(x, kept, cutoff=0.8))
+    force_of_search, energy_of_search = jax.jit(jax.value_and_grad(_energy_of_search)), jax.jit(_energy_of_search, static_argnums=2)
     for kept, now in ((nbrs, box), (scanned, box), (changed, other), (nbrs.grow(x, other), other)):
-        found, force = jax.jit(jax.value_and_grad(_energy))(x, kept)
-        right, slope = jax.value_and_grad(lambda x, now=now: _energy_of_search(x, now))(x)
+        found, force = force_of(x, kept)
+        right, slope = force_of_search(x, now)
         np.testing.assert_allclose(found, right, rtol=1e-5)
         np.testing.assert_allclose(force, slope, rtol=1e-4, atol=1e-4)
-        shorter = jax.jit(lambda x, kept: _energy(x, kept, cutoff=0.8))(x, kept)
-        np.testing.assert_allclose(shorter, _energy_of_search(x, now, 0.8), rtol=1e-5)
+        np.testing.assert_allclose(shorter_of(x, kept), energy_of_search(x, now, 0.8), rtol=1e-5)
     stretched = jax.grad(lambda lengths: _energy(x, nbrs, box=jfrnn.Box(lengths, periodic=periodic)))(jnp.asarray(LENGTHS))
     right = jax.grad(lambda lengths: _energy_of_search(x, jfrnn.Box(lengths, periodic=periodic)))(jnp.asarray(LENGTHS))
     np.testing.assert_allclose(stretched, right, rtol=1e-3)
@@ -67,8 +69,15 @@ def test_a_list_that_went_to_another_platform_keeps_its_structure(monkeypatch):
 SKEWED = np.array([[3.0, 0.0, 0.0], [0.7, 4.0, 0.0], [-0.5, 0.9, 3.5]], np.float32)
 
 
-@pytest.mark.parametrize("make", [jfrnn.search, jfrnn.search_edges])
-@pytest.mark.parametrize("vectors", [LENGTHS, SKEWED], ids=["upright", "skewed"])
+@pytest.mark.parametrize(
+    ("make", "vectors"),
+    [
+        pytest.param(jfrnn.search, SKEWED, id="skewed-search"),
+        pytest.param(jfrnn.search_edges, LENGTHS, id="upright-search_edges"),
+        slow(jfrnn.search, LENGTHS, id="upright-search"),
+        slow(jfrnn.search_edges, SKEWED, id="skewed-search_edges"),
+    ],
+)
 def test_lists_keep_what_was_found_of_their_boxes(make, vectors):
     x = jnp.asarray(np.random.default_rng(3).uniform(0, LENGTHS, (60, 3)), jnp.float32)
     box, other = jfrnn.Box(vectors), jfrnn.Box(vectors * np.float32(1.03))

@@ -109,7 +109,7 @@ def test_every_case_as_it_is(name, dtype, dim, backend):
         checked.assert_exact(nbrs, given.positions, given.cutoff, queries=given.queries, **options)
 
 
-@pytest.mark.parametrize("periodic", [False, True], ids=["open", "periodic along x"])
+@pytest.mark.parametrize("periodic", [pytest.param(False, id="open"), checked.slow(True, id="periodic along x")])
 def test_rows_of_cells_that_hold_few(periodic):
     """Pairs of a ragged surface, whose queries CUDA serves in parts, are those of array programs, and rows the same each time."""
     rng, cutoff = np.random.default_rng(5), np.float32(0.055)

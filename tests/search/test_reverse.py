@@ -268,7 +268,7 @@ MEASURED = [(box, dim, 1.0) for box in BOXES for dim in (2, 3)] + [("open", 3, 1
 PAIRWISE = [("open", 2, 1.0, True, np.float64), ("images", 3, 1.0, False, np.float32), ("open", 3, 1e-24, False, np.float32)]
 
 
-@pytest.mark.parametrize("what", ["distances", "largest"])
+@pytest.mark.parametrize("what", ["distances", slow("largest")])
 def test_second_derivatives_through_a_loop(what):
     """Of the body of a loop JAX drops rules of `jax.custom_jvp` once it has applied them."""
     x = jnp.asarray(np.random.default_rng(0).random((8, 3)), jnp.float32)

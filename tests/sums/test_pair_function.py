@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from checked import slow
 
 import jfrnn
 
@@ -84,7 +85,7 @@ def with_a_rule(r, i, j):
     return function(r @ r)
 
 
-@pytest.mark.parametrize("backend", ["warp", "brute"])
+@pytest.mark.parametrize("backend", ["warp", slow("brute")])
 def test_what_a_function_knows_may_change(monkeypatch, backend):
     """Numbers in programs and in rules for derivatives, too, which a printed jaxpr does not show."""
     x = jnp.asarray(np.random.default_rng(0).random((20, 3)), jnp.float32)
@@ -131,6 +132,7 @@ def test_rules_that_cannot_be_followed_stop_no_sum():
     np.testing.assert_allclose(jfrnn.pair_sum(by_a_loop, x, 0.5, backend="brute"), near, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_rules_in_rules_may_change():
     x, scale = jnp.asarray(np.random.default_rng(0).random((9, 3)), jnp.float32), [1.0]
 
@@ -166,7 +168,7 @@ def of_a_rule(x, scale, backend, within=""):
     return jfrnn.pair_sum(lambda r, i, j: WITHIN[within](rule, r @ r), x, 0.5, backend=backend).sum()
 
 
-@pytest.mark.parametrize("backend", ["warp", "jax"])
+@pytest.mark.parametrize("backend", ["warp", slow("jax")])
 def test_rules_that_close_over_what_moves_are_refused(backend):
     """Such a rule knows no tangent of what it closes over, which JAX takes for 0."""
     x = jnp.asarray(np.random.default_rng(0).random((9, 3)), jnp.float32)
@@ -178,7 +180,7 @@ def test_rules_that_close_over_what_moves_are_refused(backend):
             derivative(x, scale)
 
 
-@pytest.mark.parametrize("within", ["jit", "cond", "scan"])
+@pytest.mark.parametrize("within", ["scan", slow("jit"), slow("cond")])
 def test_rules_in_programs_that_close_over_what_moves_are_refused(within):
     x, scale = jnp.asarray(np.random.default_rng(0).random((9, 3)), jnp.float32), jnp.float32(0.25)
     work = functools.partial(of_a_rule, backend="jax", within=within)

@@ -136,7 +136,7 @@ def test_nothing_passes_however_it_is_thrown(turning):
     assert touched > 50
 
 
-@pytest.mark.parametrize("turning", [None, fluids.Turning((1.5, 0.5), None, 2.0)])
+@pytest.mark.parametrize("turning", [slow(None), fluids.Turning((1.5, 0.5), None, 2.0)])
 def test_a_solid_in_a_periodic_box_meets_every_image_of_the_fluid(turning):
     """Fluid that begins some periods farther along moves likewise, and feels the solid likewise; else it would go through."""
     corners, dx = np.array([[1.3, 0.4], [1.6, 0.4], [1.6, 0.7], [1.3, 0.7]]), 0.05
