@@ -118,7 +118,7 @@ def trace(
         shared, own, others = operands
         return eval_jaxpr(closed.jaxpr, shared[: len(consts)], real, shift, *shared[len(consts) :], *own, *others)
 
-    derived = make_term(evaluate, join(of_consts, operands), shift, labels)
+    derived = make_term(evaluate if consts else closed, join(of_consts, operands), shift, labels)
     if marked:
         marks = dict(marks=(True,) * len(derived.term.totals), marking=frozenset(labels[0][:1]))
         derived = derived._replace(term=dataclasses.replace(derived.term, **marks))
@@ -229,7 +229,7 @@ class Derived(NamedTuple):
 
 
 def make_term(
-    summand: Summand,
+    summand: Summand | ClosedJaxpr,
     operands: Groups,
     shift: jax.ShapeDtypeStruct,
     labels: Labels,
@@ -237,8 +237,8 @@ def make_term(
     marks: Sequence[bool] | None = None,
     marking: frozenset[int] = frozenset(),
 ) -> Derived:
-    """Trace a summand that closes over nothing, and drop the operands that it does not need."""
-    closed = _jaxpr_of(summand, operands, shift)
+    """Trace a summand that closes over nothing, unless it has been traced, and drop the operands that it does not need."""
+    closed = summand if isinstance(summand, ClosedJaxpr) else _jaxpr_of(summand, operands, shift)
     if any(isinstance(x, Tracer) for x in closed.consts):
         raise ValueError(_CLOSED)
     always = [True, True] + [False] * sum(map(len, operands))
