@@ -11,7 +11,7 @@ import numpy as np
 from jax.core import Tracer
 
 from jfrnn._geometry.reduced import count_cells, short_vectors
-from jfrnn._tracing import Given, as_array, as_dtype, own_transfers, portable
+from jfrnn._tracing import Given, Real, as_array, as_dtype, own_transfers, portable
 
 _FLAT, _FLAT_ULPS = 1e-12, 16  # the square of a height beside edges of length 1, also in units of eps, that rounding leaves of none
 _SINGULAR = 1e-9  # determinants below may be those of dependent rows
@@ -188,7 +188,7 @@ class Box:
         """
         if isinstance(self.vectors, Tracer) or isinstance(self.flags, Tracer):
             raise TypeError("images_for() reads the vectors of a box, and these are traced: ask outside of jax.jit.")
-        if isinstance(cutoff, Tracer | bool) or not isinstance(cutoff, int | float | np.floating | np.integer):
+        if isinstance(cutoff, Tracer | bool) or not isinstance(cutoff, Real):
             raise TypeError(f"cutoff must be a number, got {type(cutoff).__name__}.")
         if not 0 < cutoff < math.inf:
             raise ValueError(f"cutoff must be positive and finite, got {cutoff}.")

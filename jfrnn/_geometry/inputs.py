@@ -1,7 +1,7 @@
 """Argument checks while tracing: each error names the argument, what it was, what was expected and what to do."""
 
 import math
-from numbers import Real
+from numbers import Real as AnyReal
 from typing import Any
 
 import jax
@@ -14,7 +14,7 @@ from jax.tree_util import KeyPath
 from jfrnn._geometry.batch import Batch
 from jfrnn._geometry.box import Box, check_box_range
 from jfrnn._geometry.cutoffs import RANGE_OF, RULES, SUM, TABLE, Radii, is_radius
-from jfrnn._tracing import Given, Tree, as_array, as_dtype, gather, make_on_host, on_device, refuse_forks
+from jfrnn._tracing import Given, Real, Tree, as_array, as_dtype, gather, make_on_host, on_device, refuse_forks
 
 _MOST_POINTS = 2**31 - 32
 _MOST_SLOTS_OF_ROW = 2**31 - 1
@@ -113,6 +113,14 @@ def check_devices(name: str, given: Given, made: Given) -> None:
     )
 
 
+def is_real(given: Given) -> bool:
+    """Say whether this is a real number, or an array of them; a bool is none."""
+    kind = getattr(given, "dtype", None)
+    if kind is None:
+        return isinstance(given, AnyReal) and not isinstance(given, bool)
+    return any(jnp.issubdtype(kind, reals) for reals in (np.floating, np.integer))
+
+
 def check_cutoff(cutoff: Given, dtype: np.dtype) -> float:
     """Return one cutoff for all particles, rounded to the dtype of the positions."""
     if isinstance(cutoff, Tracer):
@@ -122,10 +130,8 @@ def check_cutoff(cutoff: Given, dtype: np.dtype) -> float:
         )
     if np.ndim(cutoff) != 0:
         raise ValueError(f"cutoff must be one number, got an array of shape {list(np.shape(cutoff))}.")
-    kind = getattr(cutoff, "dtype", None)
-    is_real = isinstance(cutoff, Real) if kind is None else any(jnp.issubdtype(kind, x) for x in (np.floating, np.integer))
-    if isinstance(cutoff, bool) or not is_real:
-        raise TypeError(f"cutoff must be a number, got {type(cutoff).__name__ if kind is None else kind}.")
+    if not is_real(cutoff):
+        raise TypeError(f"cutoff must be a number, got {getattr(cutoff, 'dtype', type(cutoff).__name__)}.")
     value = float(cutoff)
     if not (math.isfinite(value) and value > 0):
         raise ValueError(f"cutoff must be positive and finite, got {value}.")
@@ -249,7 +255,7 @@ def largest_known(radii: Radii) -> float | None:
 
 def check_skin(skin: object, cutoff: float, dtype: np.dtype) -> float:
     """Return a static skin, rounded to the dtype of the positions; 0 means no skin."""
-    if isinstance(skin, Tracer | bool) or not isinstance(skin, int | float | np.floating | np.integer):
+    if isinstance(skin, Tracer | bool) or not isinstance(skin, Real):
         raise TypeError(f"skin must be a number known while tracing, got {_describe(skin)}.")
     value, (least, most) = float(dtype.type(skin)), RANGE_OF[dtype]
     low, high = 2 * least, most - cutoff
@@ -377,7 +383,7 @@ def check_capacity(capacity: object) -> int:
 
 def check_slack(slack: object) -> float:
     """Return a static factor of at least 1."""
-    if isinstance(slack, bool) or not isinstance(slack, int | float | np.floating | np.integer):
+    if isinstance(slack, bool) or not isinstance(slack, Real):
         raise TypeError(f"slack must be a number of at least 1, known while tracing, got {_describe(slack)}.")
     if not (math.isfinite(slack) and slack >= 1):
         raise ValueError(f"slack must be finite and at least 1 (the capacity is slack times the longest row), got {slack}.")

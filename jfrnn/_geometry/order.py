@@ -2,7 +2,6 @@
 
 import functools
 from collections.abc import Callable
-from numbers import Real
 from typing import Literal
 
 import jax.numpy as jnp
@@ -12,7 +11,7 @@ from jax.core import Tracer
 
 from jfrnn._geometry.curves import Words, hilbert_digits, hilbert_words, morton_words, spread
 from jfrnn._geometry.floats import rounded_quotient
-from jfrnn._geometry.inputs import check_positions
+from jfrnn._geometry.inputs import check_positions, is_real
 from jfrnn._tracing import Given, Number, Points, compile_program, on_device, own_transfers
 
 CLASSES = 31  # of cutoffs, or of species
@@ -133,7 +132,7 @@ def _check_cell_size(cell_size: Given, dtype: np.dtype) -> np.floating:
     if isinstance(cell_size, Tracer):
         raise TypeError("cell_size must be a static number, got a traced value: pass a Python float, or make it a static argument.")
     shape = list(np.shape(cell_size))
-    if shape or isinstance(cell_size, bool) or not (isinstance(cell_size, Real) or hasattr(cell_size, "dtype")):
+    if shape or not is_real(cell_size):
         raise TypeError(f"cell_size must be one number, got {type(cell_size).__name__} of shape {shape}.")
     value, low, high = float(cell_size), float(np.finfo(dtype).tiny), float(np.finfo(dtype).max)
     if not low <= value <= high:

@@ -29,7 +29,7 @@ Given = Any  # an argument as the user passed it, before it is checked
 Aval = Any  # the type of an array in JAX's tracing: shape, dtype and the mesh axes over which it varies
 Internal = Any  # an internal object of JAX, such as a primitive, a jaxpr or a lowering context
 
-Real = float | np.floating | np.integer  # a number that is known while tracing
+Real = int | float | np.floating | np.integer  # a number that is known while tracing
 Number = Real | Array  # also an array of the shape []
 Size = int | np.integer
 Flag = bool | np.bool_
@@ -164,7 +164,8 @@ def own_transfers() -> AbstractContextManager[object]:
     """Allow the library's own transfers between host and devices, like explicit `device_put` and `device_get`.
 
     `jax.transfer_guard("disallow_explicit")` forbids these too. Arrays of users must be on the device before: transferring their
-    NumPy arrays is left to them. Whatever enters here works with arrays, so forked processes are refused.
+    NumPy arrays is left to them. Whatever enters here works with arrays, so forked processes are refused; and where an exception
+    ends it, so do the traces that JAX had begun within.
     """
     refuse_forks()
     stack = contextlib.ExitStack()

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from checked import sparing
+from checked import slow, sparing
 
 import jfrnn
 from jfrnn._engine.near_warp import prepare_for_kernels
@@ -75,15 +75,16 @@ def test_rows_are_those_of_array_programs(dim, dtype, spread, skew):
             assert most == int(known[3]) & (NOT_FINITE - 1)
 
 
+@pytest.mark.parametrize("other", ["brute", slow("jax")])
 @pytest.mark.parametrize("turns", [(128, 127), (1, 2)])
-def test_bounds_are_those_of_the_most_turns(turns):
+def test_bounds_are_those_of_the_most_turns(turns, other):
     """With a cutoff of nearly half the box, one turn more would not be sure that one image of each pair is enough."""
     x = np.random.default_rng(0).random((300, 3)).astype(np.float32)
     x[0] += turns[0]
     queries, box = x[:50] + np.float32(turns[1]), jfrnn.Box([1.0, 1.0, 1.0], images=0)
     x[1] += turns[1]
     for asked in (None, jnp.asarray(queries)):
-        found = [jfrnn.count(x, 0.499, queries=asked, box=box, backend=engine) for engine in ("warp", "brute")]
+        found = [jfrnn.count(x, 0.499, queries=asked, box=box, backend=engine) for engine in ("warp", other)]
         np.testing.assert_array_equal(*found)
 
 

@@ -418,6 +418,8 @@ BAD_SORTS = [
     ((np.zeros((3, 3)), "1"), {}, TypeError, r"cell_size must be one number, got str of shape \[\]"),
     ((np.zeros((3, 3)), True), {}, TypeError, "cell_size must be one number, got bool"),
     ((np.zeros((3, 3)), np.ones(3)), {}, TypeError, r"cell_size must be one number, got ndarray of shape \[3\]"),
+    ((np.zeros((3, 3)), np.complex64(1 + 2j)), {}, TypeError, "cell_size must be one number, got complex64"),
+    ((np.zeros((3, 3)), np.bool_(True)), {}, TypeError, "cell_size must be one number, got bool"),
     ((np.zeros((3, 3)), 0.0), {}, ValueError, "cell_size must be positive, finite and a normal float64 .*got 0.0"),
     ((np.zeros((3, 3)), -1), {}, ValueError, "cell_size must be positive, .*got -1.0"),
     ((np.zeros((3, 3)), np.nan), {}, ValueError, "cell_size must be positive, .*got nan"),

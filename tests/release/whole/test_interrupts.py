@@ -112,7 +112,6 @@ def test_what_interrupts_a_trace_leaves_none_behind(work):
             break
         finally:
             sys.setprofile(None)
-            assert isinstance(jnp.ones(2) + 1, np.ndarray | jax.Array)
             assert not isinstance(jnp.ones(2) + 1, jax.core.Tracer)
     assert ended > 0
     np.testing.assert_array_equal(WORKS[work](x), right)
