@@ -125,9 +125,15 @@ GRAPHS = {
 
 
 @functools.cache
+def has_graphs() -> bool:
+    """Say whether the driver has all that records launches."""
+    return all(hasattr(driver(), name) for name in GRAPHS.values())
+
+
+@functools.cache
 def find_decider(device: CudaDevice) -> int | None:
     """Return the handle of the function that decides whether a graph goes on, None where a driver has no such graphs."""
-    if not all(hasattr(driver(), name) for name in GRAPHS.values()):
+    if not has_graphs():
         return None
     module = load_module(device, _DECIDE)
     return None if module is None else find_function(module, "decide") or None

@@ -128,6 +128,7 @@ class _Recorded(ctypes.Structure):
     _fields_ = (
         ("arrays", ctypes.c_void_p * _MOST_ARRAYS),
         ("count", ctypes.c_int),
+        ("times", ctypes.c_int),
         ("met", ctypes.c_uint),
         ("graph", ctypes.c_void_p),
     )
@@ -235,10 +236,11 @@ def lay_plan(name: str, plan: Plan, shapes: Mapping[str, tuple[int, ...]], devic
     found.in_turns = plan.keep is not None
     found.asked = -1 if plan.asked is None else arrays.index(plan.asked)
     found.asked_words = 0 if plan.asked is None else math.prod(shapes[plan.asked])
-    if plan.asked is not None:
-        if found.asked_words > _MOST_ASKED:
-            raise ValueError(f"{name} asks {found.asked_words} words, more than {_MOST_ASKED}")
-        held.append(recorder := _make_recorder(device))
+    if found.asked_words > _MOST_ASKED:
+        raise ValueError(f"{name} asks {found.asked_words} words, more than {_MOST_ASKED}")
+    # a single launch takes no longer than a graph of it: less of the host, and more of the device
+    if device >= 0 and plan.keep is None and len(laid) > 1 and all(step.kind in (_CUDA, _CUDA_BESIDE, _CLEAR) for step in laid):
+        held.append(recorder := _make_recorder(device, plan.asked is not None))
         found.recorder = recorder and ctypes.addressof(recorder)
     if any(step.kind == _CUDA_BESIDE for step in laid):
         found.side, found.begun, found.ended = _second_stream(device)
@@ -351,11 +353,13 @@ def _second_stream(device: int) -> tuple[int, int, int]:
     return _driver.make_stream(found), _driver.make_event(found), _driver.make_event(found)
 
 
-def _make_recorder(device: int) -> _Recorder | None:
-    """Return what records launches on a CUDA device behind a condition; None where its driver cannot."""
+def _make_recorder(device: int, asked: bool) -> _Recorder | None:
+    """Return what records launches on a CUDA device, if `asked` behind a condition; None where its driver cannot."""
     found = _driver.find_device(device)
-    decide = _driver.find_decider(found)
-    return None if decide is None else _Recorder(stream=_recording_stream(device), context=found.context, decide=decide)
+    decide = _driver.find_decider(found) if asked else None
+    if not _driver.has_graphs() or (asked and decide is None):
+        return None
+    return _Recorder(stream=_recording_stream(device), context=found.context, decide=decide)
 
 
 @functools.cache

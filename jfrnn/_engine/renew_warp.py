@@ -216,7 +216,9 @@ def _plan(variant: Kind, few: bool, ordered: bool, shapes: Shapes, multiprocesso
     around = renew.renew_kernels(variant.dim, variant.double, boxed, ordered, constants_of(variant.double))
     blocks = renew.blocks(n)
     check, prepare, keep = (Launch(each, blocks * renew.BLOCK) for each in (around.check, around.prepare, around.keep))
-    steps = [check, prepare, Launch(around.settle, renew.BLOCK), *search.steps, keep]
+    cleared = [Clear(name, 4) for name in ("longest", "bits")]  # by what settles
+    rest = [step for step in search.steps if step not in cleared]
+    steps = [check, prepare, Launch(around.settle, renew.BLOCK), *rest, keep]
     numbers = {**search.numbers, "blocks": blocks}
     lacking = [*["order"] * (not ordered), *["cutoffs", "vectors", "origin", *_KEPT_OF_BOX] * (not boxed)]
     return search._replace(steps=steps, numbers=numbers, absent=[*search.absent, *lacking], asked="stale", same=same)

@@ -36,6 +36,17 @@ static int clear(unsigned long long address, unsigned, size_t words, void* strea
 }
 static int record(void* event, void* stream) { note(3, (long long)stream, (long long)event, 0); return 0; }
 static int wait(void* stream, void* event, unsigned) { note(4, (long long)stream, (long long)event, 0); return 0; }
+static long long graphs, most_graphs;  // those beyond cannot be made ready
+static int make_graph(void** graph, unsigned) { *graph = (void*)++graphs; return 0; }
+static int begin_record(void* stream, void* graph, const void*, const void*, size_t, int) {
+    note(6, (long long)stream, (long long)graph, 0);
+    return 0;
+}
+static int end_record(void* stream, void**) { note(7, (long long)stream, 0, 0); return 0; }
+static int make_ready(void** ready, void* graph, unsigned long long) { *ready = graph; return graphs > most_graphs; }
+static int drop_graph(void*) { return 0; }
+static int run_graph(void* ready, void* stream) { note(8, (long long)stream, (long long)ready, 0); return 0; }
+static int drop_ready(void* ready) { note(9, (long long)ready, 0, 0); return 0; }
 
 struct Task { XLA_FFI_Task* run; void* data; };
 static Task tasks[64];
@@ -65,7 +76,12 @@ void work_alone(const void* given) {
 }
 void take_turn() { desk->take_lock(desk->turn, 1); }
 void add_one(const void* given) { __atomic_fetch_add(*(int* const*)given, ((const int*)given)[2], __ATOMIC_RELAXED); }
-void* driver(int k) { void* all[] = {(void*)launch, (void*)clear, (void*)record, (void*)wait}; return all[k]; }
+void* driver(int k) {
+    void* all[] = {(void*)launch, (void*)clear, (void*)record, (void*)wait, (void*)make_graph, (void*)drop_graph,
+                   (void*)begin_record, (void*)end_record, (void*)make_ready, (void*)drop_ready, (void*)run_graph};
+    return all[k];
+}
+void have_graphs(int most) { graphs = 0, most_graphs = most; }
 int take_events(long long* out) {
     const int count = event_count;
     memcpy(out, events, sizeof(events[0]) * count);
@@ -110,7 +126,8 @@ const char* call(const char* kernel, int size, int device, int cuda, void* input
 }
 """
 EXECUTE, INSTANTIATE = 3, 0
-LAUNCH, CLEAR, RECORD, WAIT, WORK = range(1, 6)
+LAUNCH, CLEAR, RECORD, WAIT, WORK, BEGIN, END, RUN, DROP = range(1, 10)
+GRAPHS = "make_graph", "drop_graph", "begin_record", "end_record", "make_ready", "drop_ready", "run_graph"
 _TEXT = ctypes.c_void_p, ctypes.c_longlong
 _MAKE_PLAN = ctypes.CFUNCTYPE(None, *_TEXT, *_TEXT, ctypes.c_int, ctypes.c_void_p)
 
@@ -128,8 +145,13 @@ class Native:
         self.made, self.refused, self.laid = [], None, {}
         self.make_plan = _MAKE_PLAN(self.make)
         self.desk = plans.open_desk(self.library, ctypes.cast(self.make_plan, ctypes.c_void_p).value, 8)
-        for k, name in enumerate(("launch", "clear", "record", "wait")):
+        for k, name in enumerate(("launch", "clear", "record", "wait", *GRAPHS)):
             setattr(self.desk._desk, name, self.function("driver", ctypes.c_void_p)(k))
+
+        self.have_graphs(1000)
+
+    def have_graphs(self, most):
+        ctypes.CFUNCTYPE(None, ctypes.c_int)(self.library.address_of("have_graphs"))(most)
 
     def function(self, name, result=ctypes.c_int):
         return ctypes.CFUNCTYPE(result)(self.library.address_of(name))
@@ -156,6 +178,7 @@ class Native:
             patch.setattr(plans, "compiler", lambda: self)
             patch.setattr(plans, "_second_stream", lambda device: (7, 71, 72))
             patch.setattr(plans, "_end_of_turn", lambda device: 80 + device)
+            patch.setattr(plans, "_make_recorder", lambda device, asked: plans._Recorder(stream=5, context=6))
             self.laid[name, device] = plans.lay_plan(name, plan, ["x", "y"], device)
         self.desk.keep(self.laid[name, device])
 
@@ -204,6 +227,56 @@ def test_what_may_run_beside_the_one_before_waits_for_what_came_before_both(nati
     both = [launched(99, 1000, 2, 1), launched(7, 1000, 3, 1)]
     before, after = [(RECORD, 99, 71, 0), (WAIT, 7, 71, 0)], [(RECORD, 7, 72, 0), (WAIT, 99, 72, 0)]
     assert native.events() == [launched(99, 1000, 1, 1), *before, *both, *after, launched(99, 1000, 1, 1)]
+
+
+def test_launches_of_a_loop_are_recorded_once(native):
+    """What comes at the same addresses for the eighth time is recorded, on a stream of its own, and is a graph from then on."""
+    steps = [Clear("y", 40), native.step(1), native.step(2), native.step(3, beside=True)]
+    native.keep("loop@", 0, Plan(steps, {"number": 1}))
+
+    def call(x):
+        assert native.call("loop@", x, 2000) is None
+        return native.events()
+
+    def launches(stream, x):
+        first = [(CLEAR, stream, 2000, 10), launched(stream, x, 1, 1), (RECORD, stream, 71, 0), (WAIT, 7, 71, 0)]
+        both = [launched(stream, x, 1, 1), launched(7, x, 1, 1)]
+        return [*first, *both, (RECORD, 7, 72, 0), (WAIT, stream, 72, 0)]
+
+    for _ in range(7):
+        assert call(1000) == launches(99, 1000)
+    assert call(1000) == [(BEGIN, 5, 1, 0), *launches(5, 1000), (END, 5, 0, 0), (RUN, 99, 1, 0)]
+    assert call(1000) == [(RUN, 99, 1, 0)]
+    assert call(1001) == launches(99, 1001)  # stands elsewhere
+    for x in range(2000, 2030):
+        call(x)
+        assert call(1000) == [(RUN, 99, 1, 0)]  # among the 32 that were met last
+    for x in range(3000, 3031):
+        assert call(x) == launches(99, x)
+    assert call(3031) == [(DROP, 1, 0, 0), *launches(99, 3031)]
+    for _ in range(7):
+        call(3031)
+    native.desk.drop(native.laid.pop(("loop@", 0)))
+    assert native.events() == [(DROP, 2, 0, 0)]
+
+
+def test_where_a_driver_cannot_record_all_is_launched(native):
+    native.keep("loop@", 0, Plan([native.step(1), native.step(2)], {"number": 1}))
+    native.keep("fails@", 0, Plan([native.step(1), native.step(1)], {"number": 13}))
+    failure = b"fails: a launch failed with CUDA's error 700"
+    assert [native.call("fails@") for _ in range(10)] == 10 * [failure]
+    assert [event[0] for event in native.events()] == [*7 * [LAUNCH], BEGIN, LAUNCH, END, *3 * [LAUNCH]]
+    native.have_graphs(0)
+    for k in range(12):
+        assert native.call("loop@", 1000) is None
+        assert [event[1] for event in native.events()] == ([99, 99] if k != 7 else [5, 5, 5, 5, 99, 99])  # it tries once
+
+
+def test_single_launches_and_those_beside_work_of_the_host_are_not_recorded(native):
+    native.keep("one@", 0, Plan([native.step(1)], {"number": 1}))
+    native.keep("host@", 0, Plan([native.step(1), native.step_on_host()], {"number": 1}))
+    native.keep("turns@", 0, taking_turns(native.step(1), native.step(1)))
+    assert not any(laid.plan.recorder for laid in native.laid.values())
 
 
 def test_an_unknown_name_is_asked_for_once_per_device(native):

@@ -10,7 +10,8 @@ struct RenewArguments {
     const real* limit;    // [1] the square of a motion below which a list holds
     const real* cutoffs;  // a row of LATTICE_END + 1 for each number of turns: what a search is given; whether it is enough
     const real *vectors, *origin;                    // [DIM] of the box
-    const int *longest, *bits, *scratch;             // what the search has found
+    const int* scratch;                              // of the search
+    int *longest, *bits;                             // what the search has found
     real *reference, *kept_vectors, *kept_origin;    // kept: [n, DIM] and [DIM]
     int *status, *required, *rebuild_count, *order;  // kept: [1], and [n]
     real *positions, *cutoff;                        // scratch: [n, ROW] and [LATTICE_END], what the search is given
@@ -67,7 +68,7 @@ struct Renew : RenewArguments {
             parts[2 * blockIdx.x + 1] = near;
         }
     }
-    // One block: adds up what all of them have met, and chooses what the search is given.
+    // One block: adds up what all of them have met, and chooses what the search is given, which has found nothing yet.
     JFRNN_MEMBER void settle() const {
         __shared__ int met, near;
         if (threadIdx.x == 0)
@@ -86,6 +87,7 @@ struct Renew : RenewArguments {
         if (threadIdx.x == 0) {
             parts[0] = met;
             parts[1] = near;
+            *longest = *bits = 0;
         }
         for (int k = threadIdx.x; PERIODIC && k < DIM; k += BLOCK) {
             kept_vectors[k] = vectors[k];

@@ -10,6 +10,9 @@ enum Kind { ONCE, SHARED, CUDA, CUDA_BESIDE, CLEAR, HUGE_PAGES };  // ONCE: on t
 // In place of a CUDA device; SOON: a program is being made, most likely for the first device that the process uses.
 static constexpr int ON_CPU = -1, CUDA_SOON = -2, CPU_SOON = -3;
 static constexpr int MOST_ARRAYS = 48, MOST_BYTES = 1024, MOST_WORDS = 1024, MOST_RECORDED = 32, MOST_ASKED = 1024;
+// How often the same addresses are met before launches are recorded, which takes much longer than they do: where the host would wait
+// else, and where it would not.
+static constexpr int OFTEN_TO_ASK = 2, OFTEN = 8;
 
 struct Step {
     void* function;                  // CPU: called with the address of the arguments; CUDA: a function of the driver
@@ -20,17 +23,17 @@ struct Step {
     int block;          // CUDA: threads of a block
     long long threads;  // CPU: how many may share the work; CUDA: in all; of what is cleared or in huge pages: bytes
 };
-// Launches that were recorded for arrays at certain addresses: a graph of CUDA, or none yet where they were met once.
+// Launches that were recorded for arrays at certain addresses: a graph of CUDA, or none yet where they were not met often.
 struct Recorded {
     void* arrays[MOST_ARRAYS];
-    int count;
+    int count, times;
     unsigned int met;  // the turn in which it was met last
     void* graph;
 };
 // What records launches on a device, where its driver has graphs that decide by themselves what runs.
 struct Recorder {
     void *stream, *context;
-    void* decide;  // a function of the driver: lets a graph go on if a word is not 0
+    void* decide;  // of what is asked, a function of the driver: lets a graph go on if a word is not 0
     Recorded recorded[MOST_RECORDED];
     unsigned int turn;
     int locked, fails;

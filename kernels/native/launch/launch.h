@@ -170,26 +170,33 @@ struct Work {
         fill(step, bytes);
         ((Function)step.function)(bytes);
     }
+    // Where arrays stand at addresses that were met lately, as in a loop, launches were recorded in a graph: one call of the driver then
+    // takes less of the host than a launch does.
     int run_on_cuda() const {
+        int wrong = 0;
+        if (plan.recorder != nullptr && runs_recorded(*plan.recorder, wrong))
+            return wrong;
         if (plan.asked >= 0)
             return run_if_asked();
         if (!plan.in_turns)
             return launch_all(0);
-        int wrong = desk->wait(stream, plan.ended, 0);  // for calls before, on other streams
+        wrong = desk->wait(stream, plan.ended, 0);  // for calls before, on other streams
         wrong = wrong ? wrong : launch_all(0);
         const int lost = desk->record(plan.ended, stream);
         return wrong ? wrong : lost;
     }
     int launch_all(int first) const {
+        const Lock lock(plan.side ? &desk->forking : nullptr);
+        return launch_steps(first, stream);
+    }
+    int launch_steps(int first, void* on) const {
         int wrong = 0;
         for (int k = first; k < plan.step_count && !wrong; ++k) {
-            const bool forks = is_forked(k);
-            const Lock lock(forks ? &desk->forking : nullptr);
-            wrong = forks ? launch_both(plan.steps + k++, stream) : begin(plan.steps[k], stream);
+            const bool forks = k + 1 < plan.step_count && plan.steps[k + 1].kind == CUDA_BESIDE;
+            wrong = forks ? launch_both(plan.steps + k++, on) : begin(plan.steps[k], on);
         }
         return wrong;
     }
-    bool is_forked(int k) const { return k + 1 < plan.step_count && plan.steps[k + 1].kind == CUDA_BESIDE; }
     int begin(const Step& step, void* on) const {
         if (step.kind == CLEAR)
             return desk->clear((unsigned long long)arrays[step.arrays[1]], 0, (size_t)step.threads / 4, on);
@@ -198,14 +205,11 @@ struct Work {
         run_once(step);
         return 0;
     }
-    // The first step, and the others if they are asked for. The host reads whether they are, and waits, where arrays stand at
-    // addresses that were not met lately; where they were, as in a loop, the device decides: launches are recorded in a graph.
+    // The first step, and the others if they are asked for: the host reads whether they are, and waits. Where launches are recorded, the
+    // device decides.
     int run_if_asked() const {
-        int wrong = 0;
-        if (plan.recorder != nullptr && runs_recorded(*plan.recorder, wrong))
-            return wrong;
         int words[MOST_ASKED], asked = 0;
-        wrong = begin(plan.steps[0], stream);
+        int wrong = begin(plan.steps[0], stream);
         wrong = wrong ? wrong : desk->read(words, (unsigned long long)arrays[plan.asked], (size_t)plan.asked_words * 4, stream);
         wrong = wrong ? wrong : desk->finish(stream);
         for (int k = 0; k < plan.asked_words && !wrong; ++k)
@@ -222,7 +226,7 @@ struct Work {
                 same = each.arrays[k] == arrays[k];
             if (same) {
                 each.met = recorder.turn;
-                if (each.graph == nullptr && !recorder.fails) {
+                if (each.graph == nullptr && !recorder.fails && ++each.times >= (plan.asked >= 0 ? OFTEN_TO_ASK : OFTEN)) {
                     each.graph = record(recorder);
                     recorder.fails = each.graph == nullptr;
                 }
@@ -236,22 +240,34 @@ struct Work {
             desk->drop_ready(oldest->graph);
         oldest->graph = nullptr;
         oldest->count = count;
+        oldest->times = 1;
         oldest->met = recorder.turn;
         memcpy(oldest->arrays, arrays, (size_t)count * sizeof(void*));
         return false;
     }
-    // Returns a graph of the first step, and of the others behind a condition; none where the driver cannot make it.
+    // Returns a graph of all steps, those that are asked for behind a condition; none where the driver cannot make it.
     void* record(const Recorder& recorder) const {
         void *graph = nullptr, *ready = nullptr;
         const Lock lock(&desk->forking);  // these streams are those of all calls on a device
         if (desk->make_graph(&graph, 0))
             return nullptr;
-        if (record_into(recorder, graph) || desk->make_ready(&ready, graph, 0))
+        const int wrong = plan.asked >= 0 ? record_if_asked(recorder, graph)
+                                          : record_into(graph, recorder.stream, [&] { return launch_steps(0, recorder.stream); });
+        if (wrong || desk->make_ready(&ready, graph, 0))
             ready = nullptr;
         desk->drop_graph(graph);
         return ready;
     }
-    int record_into(const Recorder& recorder, void* graph) const {
+    template <class Launches>
+    int record_into(void* graph, void* on, Launches launches) const {
+        int wrong = desk->begin_record(on, graph, nullptr, nullptr, 0, 2);
+        if (wrong)
+            return wrong;
+        wrong = launches();
+        const int lost = desk->end_record(on, &graph);
+        return wrong ? wrong : lost;
+    }
+    int record_if_asked(const Recorder& recorder, void* graph) const {
         // CUgraphNodeParams of a conditional node
         struct Condition {
             int type = 13, reserved[3] = {};
@@ -272,22 +288,14 @@ struct Work {
         } given = {node.condition, arrays[plan.asked], plan.asked_words};
         void *before[4], *conditional = nullptr, *arguments[3] = {&given.condition, &given.words, &given.count};
         size_t count_before = 4;
-        wrong = wrong ? wrong : desk->begin_record(recorder.stream, graph, nullptr, nullptr, 0, 2);
-        if (wrong)
-            return wrong;
-        wrong = begin(plan.steps[0], recorder.stream);
-        wrong = wrong ? wrong : desk->launch(recorder.decide, 1, 1, 1, 256, 1, 1, 0, recorder.stream, arguments, nullptr);
-        int lost = desk->end_record(recorder.stream, &graph);
-        wrong = wrong ? wrong : lost;
+        auto ask = [&] {
+            const int lost = begin(plan.steps[0], recorder.stream);
+            return lost ? lost : desk->launch(recorder.decide, 1, 1, 1, 256, 1, 1, 0, recorder.stream, arguments, nullptr);
+        };
+        wrong = wrong ? wrong : record_into(graph, recorder.stream, ask);
         wrong = wrong ? wrong : desk->nodes_of(graph, before, &count_before);
         wrong = wrong ? wrong : desk->add_node(&conditional, graph, before, count_before, &node);
-        wrong = wrong ? wrong : desk->begin_record(recorder.stream, node.bodies[0], nullptr, nullptr, 0, 2);
-        if (wrong)
-            return wrong;
-        for (int k = 1; k < plan.step_count && !wrong; ++k)
-            wrong = is_forked(k) ? launch_both(plan.steps + k++, recorder.stream) : begin(plan.steps[k], recorder.stream);
-        lost = desk->end_record(recorder.stream, node.bodies);
-        return wrong ? wrong : lost;
+        return wrong ? wrong : record_into(node.bodies[0], recorder.stream, [&] { return launch_steps(1, recorder.stream); });
     }
     void run_on_cpu() const {
         alignas(16) unsigned char bytes[MOST_BYTES];

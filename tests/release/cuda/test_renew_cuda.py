@@ -54,7 +54,7 @@ class OneThread:
         vectors, origin = np.full(3, LENGTH, dtype), np.zeros(3, dtype)
         self.arrays = {
             "now": now, "limit": np.array([half.inside], dtype), "cutoffs": numbers, "vectors": vectors, "origin": origin,
-            "longest": np.array([5], np.int32), "bits": np.zeros(1, np.int32), "reference": before.copy(),
+            "longest": np.array([7], np.int32), "bits": np.ones(1, np.int32), "reference": before.copy(),
             "scratch": np.arange(10_000 + 8 * n, dtype=np.int32),
             "kept_vectors": vectors.copy(), "kept_origin": origin.copy(), "status": np.zeros(1, np.int32),
             "required": np.array([3], np.int32), "rebuild_count": np.zeros(1, np.int32), "order": np.zeros(n, np.int32),
@@ -135,6 +135,8 @@ def test_a_search_is_given_what_another_one_is(dim, dtype, boxed, spread):
         np.testing.assert_array_equal(np.delete(arrays["cutoff"], bounds), np.delete(numbers, bounds))
         np.testing.assert_array_less(numbers[bounds], 1e-30 + arrays["cutoff"][bounds] * (1 + 4 * np.finfo(dtype).eps))
         assert arrays["cutoff"][28] <= 3 * numbers[28]
+    assert (int(arrays["longest"][0]), int(arrays["bits"][0])) == (0, 0)  # as a search begins
+    arrays["longest"][0] = 5
     kernels.run("keep")
     checks = {bit: not bool(ok) for bit, ok in given.checks.items()}
     checks |= {Status.NONFINITE: boxed and bool(np.isnan(now).any())}
