@@ -351,6 +351,12 @@ def check_values(name: str, values: Tree, size: int, what: str, more: str = "") 
         if tuple(leaf.shape[:1]) != (size,):
             raise ValueError(f"{full} must have shape [{size}, ...], one row per {what}, got {list(leaf.shape)}{more}.")
         if isinstance(leaf, np.ndarray):
+            try:
+                jax.typeof(leaf)
+            except TypeError:
+                raise TypeError(
+                    f"{full} must hold numbers of a dtype that JAX has, got {leaf.dtype}: convert them, e.g. .astype(np.float32)."
+                ) from None
             refuse_wrapping(full, leaf)
         return leaf
 

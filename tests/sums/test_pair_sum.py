@@ -845,6 +845,7 @@ pair_sum = functools.partial(jfrnn.pair_sum, same, X, 1.0)
         (ValueError, "backend must be one of", lambda: pair_sum(backend="numpy")),
         (ValueError, r"values\['m'\] must have shape \[4, ...\], one row per particle, got \[3\]", lambda: pair_sum({"m": M[:3]})),
         (TypeError, r"values\['m'\] must be an array with a row per particle, got float", lambda: pair_sum({"m": 1.0})),
+        (TypeError, r"values\['m'\] must hold numbers of a dtype that JAX has, got >f4", lambda: pair_sum({"m": M.astype(">f4")})),
         (ValueError, r"query_values must have shape \[3, ...\], one row per query", lambda: pair_sum(queries=Q, query_values=M)),
         (ValueError, "query_values belong to queries", lambda: pair_sum(query_values=M)),
         (ValueError, "cutoff must be given", lambda: jfrnn.pair_sum(lambda r, i, j: r, X, None)),
