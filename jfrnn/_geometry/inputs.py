@@ -269,7 +269,7 @@ def check_skin(skin: object, cutoff: float, dtype: np.dtype) -> float:
 
 def check_active(active: Given, positions: Array) -> Array:
     """Return the mask of active particles, [n] bool."""
-    active = as_array("active", active)
+    active = as_array("active", active, empty=bool)
     if not hasattr(active, "dtype") or np.dtype(active.dtype) != np.bool_:
         raise TypeError(f"active must be an array of bool, one per particle, got {_describe_array(active)}.")
     if tuple(active.shape) != positions.shape[:1]:
@@ -300,7 +300,7 @@ def _check_numbers(name: str, of: str, systems: Given, size: int, what: str) -> 
 
     Traced integers that are wider are taken; the largest int32 stands for those that do not fit.
     """
-    systems = as_array(name, systems)
+    systems = as_array(name, systems, empty=int)
     if not hasattr(systems, "dtype") or not np.issubdtype(systems.dtype, np.integer):
         raise TypeError(f"{name} must be an array of integers, the {of} of each {what}, got {_describe_array(systems)}.")
     if tuple(systems.shape) != (size,):

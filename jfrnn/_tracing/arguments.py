@@ -43,15 +43,17 @@ Backend = Literal["auto", "warp", "jax", "hashgrid", "brute"]
 RadiusRule = Literal["gather", "scatter", "either", "both", "mean", "sum"]
 
 
-def as_array(name: str, given: Given, dtype: np.dtype | type[float] | None = None) -> Given:
+def as_array(name: str, given: Given, dtype: np.dtype | type[float] | None = None, empty: type | None = None) -> Given:
     """Return lists of numbers as a NumPy array, and everything else as it is; refuse arrays of other libraries.
 
     A list becomes an array of the dtype, `float` standing for float64 in JAX's 64-bit mode, else float32; without one, of what
-    NumPy makes of it. Errors name the argument: a TypeError tells of a list that is not one of numbers, or of an array that can
-    become one of JAX or NumPy, a ValueError of a symbol of `jax.export` in a shape.
+    NumPy makes of it, or, as NumPy makes floats of nothing, of the type `empty` if there is nothing in it. Errors name the
+    argument: a TypeError tells of a list that is not one of numbers, or of an array that can become one of JAX or NumPy, a
+    ValueError of a symbol of `jax.export` in a shape.
     """
     if isinstance(given, list | tuple):
-        return _of_numbers(name, given, dtype)
+        array = _of_numbers(name, given, dtype)
+        return array if array.size or empty is None else array.astype(empty)
     if not isinstance(given, Array | np.ndarray | np.generic):
         if hasattr(given, "__dlpack__"):
             kind = f"{type(given).__module__}.{type(given).__qualname__}"

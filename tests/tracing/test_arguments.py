@@ -45,6 +45,14 @@ def test_lists_are_arrays_elsewhere_too():
     assert np.asarray(corners).tolist() == [[0, 0], [1, 0]]
 
 
+def test_lists_may_be_empty():
+    none = np.zeros((0, 2))
+    for options in ({"batch": []}, {"active": []}, {"batch": ([0] * 3, []), "queries": none}):
+        assert jfrnn.count(none if "queries" not in options else POINTS, 1.0, **options).shape == (0,)
+    assert jfrnn.count(none, [[1.0]], species=[]).shape == (0,)
+    refuses(ValueError, r"batch must have shape \[3\], .*got shape \[0\]", jfrnn.count, POINTS, 1.0, batch=[])
+
+
 @pytest.mark.parametrize("name", ["positions", "cutoff", "queries", "active", "batch", "species", "exclude", "box", "values"])
 def test_arrays_of_others_come_by_dlpack(name):
     given = {"positions": POINTS, "cutoff": [[1.0]] if name == "species" else 1.0} | {name: Foreign()}
