@@ -187,7 +187,7 @@ def mark_rows(x: Array, good: Array) -> Array:
     if jnp.issubdtype(x.dtype, jnp.floating):
         return x * _spread(jnp.where(good, 1, jnp.nan).astype(x.dtype), x.ndim)
     limits = jnp.iinfo(x.dtype)
-    return jnp.where(_spread(good, x.ndim), x, limits.min or limits.max)
+    return jnp.where(_spread(good, x.ndim), x, x.dtype.type(limits.min or limits.max))
 
 
 def _spread(good: Array, ndim: int) -> Array:

@@ -879,8 +879,9 @@ def test_integers_that_do_not_fit_are_refused():
 def test_unsigned_integers_are_marked_by_the_largest():
     """The smallest is 0, which a sum may be."""
     x = np.array([[0, 0], [1, 0], [np.nan, 0]], X.dtype)
-    sums = jfrnn.pair_sum(lambda r, i, j: j, x, 2.0, np.ones(3, np.uint8))
-    assert sums.dtype == np.uint8 and sums.tolist() == [1, 1, 255]
+    for dtype in (np.uint8, np.uint32):
+        sums = jfrnn.pair_sum(lambda r, i, j: j, x, 2.0, np.ones(3, dtype))
+        assert sums.dtype == dtype and sums.tolist() == [1, 1, np.iinfo(dtype).max]
 
 
 @pytest.mark.parametrize("backend", ["warp", "jax"])
