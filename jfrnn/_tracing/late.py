@@ -11,7 +11,7 @@ nothing varies; its results then vary over all axes over which any operand does.
 import contextlib
 import contextvars
 import functools
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -97,12 +97,21 @@ def _late() -> Internal:
     return late
 
 
-def without_mesh() -> contextlib.AbstractContextManager[object]:
-    """Trace as where no mesh of devices is set; of older releases of JAX, only where none is."""
+@contextlib.contextmanager
+def without_mesh() -> Iterator[None]:
+    """Trace as where no mesh of devices is set; of older releases of JAX, only where none is.
+
+    Over which axes closed-over arrays vary is not asked then: no array could be made to vary like them.
+    """
     use = getattr(jax.sharding, "use_abstract_mesh", None)
-    if use is None or jax.sharding.get_abstract_mesh().empty:
-        return contextlib.nullcontext()
-    return use(jax.sharding.AbstractMesh((), ()))
+    with contextlib.ExitStack() as contexts:
+        if use is not None and not jax.sharding.get_abstract_mesh().empty:
+            contexts.enter_context(use(jax.sharding.AbstractMesh((), ())))
+            with contextlib.suppress(ImportError, AttributeError):
+                from jax._src import config
+
+                contexts.enter_context(config._check_vma(False))
+        yield
 
 
 def varying_axes(tree: Tree) -> tuple[str, ...]:

@@ -134,3 +134,19 @@ def test_cond_and_shard_map_on_one_device(backend):
     for got in (chosen, mapped):
         for one, other in zip(got, expected, strict=True):
             np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.parametrize("backend", ["warp", "jax"])
+def test_functions_of_pairs_close_over_what_varies_over_a_mesh(backend):
+    mesh = jax.make_mesh((1,), ("system",), axis_types=(jax.sharding.AxisType.Auto,))
+    spec, lengths = PartitionSpec("system"), jnp.array([0.7], X.dtype)
+
+    def summed(x, length):
+        def fn(r, i, j):
+            return jnp.where(r @ r < length[0], jax.nn.relu(length[0] - r @ r), 0)
+
+        return jfrnn.pair_sum(fn, x, CUTOFF, backend=backend)
+
+    for fn in (summed, jax.grad(lambda x, length: summed(x, length).sum(), 1)):
+        mapped = jax.shard_map(fn, mesh=mesh, in_specs=(PartitionSpec(), spec), out_specs=spec)
+        np.testing.assert_array_equal(jax.jit(mapped)(X[0], lengths), fn(X[0], lengths))
