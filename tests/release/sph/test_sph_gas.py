@@ -176,6 +176,30 @@ def test_a_blast_in_space_keeps_its_energy():
     assert float(jnp.max(gas.density_and_pressure(model, s)[0])) > 2
 
 
+@pytest.mark.parametrize("heat", [1e-2, 1e-8])
+def test_cold_clouds_that_meet_keep_their_energy(heat):
+    """Before they meet, neither sound nor the divergence of the flow says how soon they do."""
+    blocks = [fluids.lattice((place, 0.0), (8, 8), 0.05) for place in (0.0, 0.6)]
+    x, drift = np.concatenate(blocks), np.array([[100.0, 0.0]])  # the same as seen by who flies past
+    scene = fluids.GasScene(
+        name="clouds",
+        positions=x,
+        velocities=drift + np.where(np.arange(len(x))[:, None] < 64, 1.0, -1.0) * [1.0, 0.0],
+        masses=np.full(len(x), 0.05**2),
+        spacing=0.05,
+        duration=0.2,
+        step=None,
+        physics=fluids.Gas(heat_ratio=GAMMA, smoothing_ratio=RATIO, artificial=1.0),
+        energies=np.full(len(x), heat),
+    )
+    model = make_model(scene)
+    first = jax.jit(solver.begin)(model, make_state(scene))
+    s, _, steps = solver.advance_until(model, first, None, scene.duration)
+    before, after = (sum(map(float, solver.energies(model, each._replace(v=each.v - drift)).values())) for each in (first, s))
+    assert after == pytest.approx(before, rel=1e-2) and steps < 100
+    assert s.gas.u.max() > 0.1
+
+
 def invoke(*arguments):
     return command("run", "sedov", *arguments)[2]
 
