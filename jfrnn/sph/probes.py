@@ -13,7 +13,7 @@ from jfrnn.sph import solids, solver
 from jfrnn.sph.errors import SceneError
 from jfrnn.sph.forces import fluid
 from jfrnn.sph.pairs import Pair, Values, total
-from jfrnn.sph.particles import Flow, Model, State, active, mass_there, own_acceleration, wrapped
+from jfrnn.sph.particles import Flow, GasModel, Model, State, active, mass_there, own_acceleration, wrapped
 
 Probe = Callable[[Any, State], Any]
 """(model, state) -> numbers, arrays, or a dict of them; inside jit."""
@@ -27,10 +27,12 @@ def pressure_at(points: Any) -> Probe:  # noqa: ANN401
     Source: Shepard (1968), doi:10.1145/800186.810616: the mean over the fluid, weighed by volumes times the kernel.
     """
 
-    def probe(model: Model, s: State) -> Array:
+    def probe(model: Flow, s: State) -> Array:
         at = jnp.asarray(points, s.x.dtype)
         if at.ndim != 2 or at.shape[1] != s.x.shape[1]:
             raise SceneError(f"points must have shape [k, {s.x.shape[1]}], got {list(at.shape)}.")
+        if isinstance(model, GasModel):
+            raise SceneError("pressure_at is a probe of fluids, got a gas: take density_and_pressure(model, s)[1] of particles.")
         rho, p = solver.density_and_pressure(model, s)
         values = {"volume": model.m / rho, "p": p} | ({} if model.wall is None else {"wall": model.wall})
 
@@ -104,7 +106,9 @@ def force_on_walls(about: Sequence[float] | None = None) -> Probe:
         A probe of {"force": shape [d], "torque": shape [3], in 2D []}.
     """
 
-    def probe(model: Model, s: State) -> dict[str, Array]:
+    def probe(model: Flow, s: State) -> dict[str, Array]:
+        if isinstance(model, GasModel):
+            raise SceneError("force_on_walls is a probe of fluids, got a gas, which has no walls: leave it out.")
         a = s.a
         if model.guided is not None:  # particles that keep their velocity have no acceleration, and yet push others: let go of them
             free = replace(model, guided=None, physics=replace(model.physics, integrator="symplectic"))

@@ -14,7 +14,8 @@ from test_sph_commands import read_table
 from experiments.sph import answers
 from experiments.sph.validation import CASES, Seen
 from jfrnn.cases import fluids
-from jfrnn.sph import budget, gas, health, snapshots, solver
+from jfrnn.sph import budget, gas, health, probes, snapshots, solver
+from jfrnn.sph.errors import SceneError
 from jfrnn.sph.model import make_model, make_state
 
 GAMMA, RATIO = 1.4, 1.3
@@ -234,9 +235,12 @@ def test_a_run_tells_its_energies_and_goes_on(tmp_path):
     assert (tmp_path / "energies.csv").read_text() == text
 
 
-def test_what_a_gas_has_not_is_refused(tmp_path):
+def test_what_a_gas_has_not_is_refused(begun, tmp_path):
     with pytest.raises(ValueError, match="wall must be None in a scene of a gas, which is in open space"):
         make_model(replace(CLOUD, wall=np.zeros(40, bool)))
+    model, s = make_model(CLOUD), begun[0]
+    refuses(SceneError, "pressure_at is a probe of fluids, got a gas", probes.pressure_at([(0.0, 0.0)]), model, s)
+    refuses(SceneError, "force_on_walls is a probe of fluids, got a gas", probes.force_on_walls(), model, s)
     said = invoke("--neighbors", "list", "--out", tmp_path)
     assert "neighbors 'list': which pairs scene 'sedov' has changes in every step" in said
     assert "says nothing of thermal energies" in invoke("--initial", tmp_path / "x.csv")
