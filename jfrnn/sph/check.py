@@ -200,15 +200,20 @@ def check_physics(physics: Any) -> None:  # noqa: ANN401
 
 def _check_fluid(scene: FluidScene) -> None:
     """Refuse physics that does not go with where the particles are."""
-    physics, smoothing = scene.physics, float(scene.physics.smoothing) / scene.spacing
+    physics = scene.physics
     if scene.guided != 0:
         _check_number("guided", scene.guided)
     if physics.gravity is not None and len(physics.gravity) != scene.dim:
         raise SceneError(f"gravity has {len(physics.gravity)} components, expected {scene.dim} in {scene.dim}D")
-    if not LEAST_SMOOTHING <= smoothing <= MOST_SMOOTHING:
-        spacing = f"{LEAST_SMOOTHING:g} to {MOST_SMOOTHING:g} particle spacings of {scene.spacing:.4g} m"
-        raise SceneError(f"smoothing is {physics.smoothing:.4g} m, expected {spacing}")
+    check_smoothing(physics, scene.spacing)
     _check_thickness(scene)
+
+
+def check_smoothing(physics: Any, spacing: float) -> None:  # noqa: ANN401
+    """Refuse a smoothing length that meets no particles, or so many that they do not fit into memory."""
+    if not LEAST_SMOOTHING <= float(physics.smoothing) / spacing <= MOST_SMOOTHING:
+        expected = f"{LEAST_SMOOTHING:g} to {MOST_SMOOTHING:g} particle spacings of {spacing:.4g} m"
+        raise SceneError(f"smoothing is {physics.smoothing:.4g} m, expected {expected}")
 
 
 def _check_thickness(scene: FluidScene) -> None:

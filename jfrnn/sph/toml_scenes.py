@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 import jfrnn
 from jfrnn.cases.fluids import FluidScene, Periodic, Physics, Tank, Turning, inflow, lattice
 from jfrnn.sph import ranges
-from jfrnn.sph.check import check_physics, check_scene
+from jfrnn.sph.check import check_physics, check_scene, check_smoothing
 from jfrnn.sph.errors import SceneError
 from jfrnn.sph.files import read_solid, with_solid
 from jfrnn.sph.kernels import KERNELS
@@ -214,6 +214,7 @@ def _physics(given: Own) -> Physics[float, tuple[float, ...]]:
     except TypeError as error:
         raise SceneError(f"physics: {str(error).partition(') ')[2] or error}") from error
     check_physics(physics)
+    check_smoothing(physics, given.spacing)  # walls are as thick as it reaches
     return physics
 
 

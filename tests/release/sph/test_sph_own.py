@@ -407,6 +407,7 @@ def test_a_mistake_in_what_is_written_is_named(tmp_path, more, message):
         ("upper = [0.4, 0.3]", "upper = [0.04, 0.3]", "fill: from .* there is no room for particles 0.1 m apart"),
         ("velocity = [0.5, 0.0]", "velocity = [0.5]", "fill.velocity must have 2 numbers"),
         ('open = ["+y"]', 'open = ["up"]', r"walls\[0\].open\[0\]: input should be '-x', "),
+        ("density = 1000.0", "smoothing = 150000\ndensity = 1000.0", "smoothing is 1.5e.05 m, expected 0.1 to 50 particle"),
         ("[0.0, -9.81]", "[0.0, 0.0, -9.81]", "gravity has 3 components, expected 2 in 2D"),
         ("velocity = [0.0, -1.0]", "velocity = [0.0, 0.0]", "inflow.velocity must have 2 numbers that are not all 0"),
         ("upper = [0.1, 0.6]", "upper = [0.1, 0.7]", "inflow must be one spacing of 0.1 m thick along y"),
