@@ -39,6 +39,8 @@ def check_scene(scene: Scene) -> None:
     for name, place in (("tank", scene.tank), ("bounds", scene.bounds), ("sealed", scene.sealed), ("outflow", scene.outflow)):
         if place is not None:
             _check_corners(name, place.lower, place.upper, scene.dim)
+    if scene.tank is not None:
+        _check_inside(scene.positions, scene.tank)
     if scene.bounds is not None and not np.isfinite([scene.bounds.lower, scene.bounds.upper]).all():
         raise SceneError(f"bounds must be finite, for they are what pictures show, got {scene.bounds}.")
     if scene.periodic is not None:
@@ -154,6 +156,14 @@ def _check_corners(name: str, lower: Sequence[float], upper: Sequence[float], di
         _check_vector(f"{name}.{part}", corner, dim)
     if not all(low < high for low, high in zip(lower, upper, strict=True)):
         raise SceneError(f"{name} must reach from a lower to an upper corner, got {tuple(lower)!r} and {tuple(upper)!r}.")
+
+
+def _check_inside(positions: np.ndarray, tank: fluids.Tank) -> None:
+    """Refuse particles beyond a wall of the tank: the first step would put all of them onto it."""
+    outside = ((positions < np.asarray(tank.lower)) | (positions > np.asarray(tank.upper))).any(axis=1)
+    if outside.any():
+        k = int(outside.argmax())
+        raise SceneError(f"tank must hold all particles, but particle {k} is at {positions[k].tolist()} m, outside of {tank}.")
 
 
 def _check_solid(solid: fluids.Solid, dim: int) -> None:

@@ -41,6 +41,7 @@ def turning(center=(0.0, 0.0), rate=1.0):
         ({"step": -1.0}, "step must be a finite number above 0, got -1.0"),
         ({"step": 1e-12}, "step: takes steps of 1e-12 s for 1 s, expected up to"),
         ({"tank": fluids.Tank((0.0,) * 3, (1.0,) * 3)}, r"tank.lower must have a number for each of 2 axes, got tuple \(0"),
+        ({"tank": fluids.Tank((0.0, 0.0), (0.6, 1.0))}, r"tank must hold all particles, but particle 0 is at \[0.636\d*, 0.269"),
         ({"outflow": ((0.0, 0.0), (1.0, 1.0))}, r"outflow must be a Tank or None, got tuple \(\(0.0, 0.0\), \(1.0, 1.0\)\)"),
         ({"bounds": fluids.Tank(None, None)}, "bounds.lower must have a number for each of 2 axes, got NoneType None"),
         ({"physics": {"density": 1000.0}}, "physics must be a Physics, got dict"),
