@@ -83,12 +83,27 @@ def make_model(scene: Scene, dtype: type | None = None, backend: str = "auto", *
             inside jit. Numbers in it that are to be traced are arguments of a `jax.tree_util.Partial`.
 
     Raises:
-        SceneError: As `check_scene`; or a periodic box is too small for the kernel, or parts of the physics do not go together.
+        SceneError: As `check_scene`; or a periodic box is too small for the kernel, or parts of the physics do not go together, or
+            numbers are too large or too small for the dtype.
     """
     check_scene(scene)
+    _check_range(scene, choose_dtype(dtype))
     if force is not None and not isinstance(force, jax.tree_util.Partial):
         force = jax.tree_util.Partial(force)
     return kind_of(scene).make_model(scene, choose_dtype(dtype), backend, force)
+
+
+def _check_range(scene: Scene, dtype: type) -> None:
+    """Refuse lengths and masses of which sums over pairs take powers and products that the dtype has not."""
+    spacing, least, largest = np.array([scene.spacing, np.min(scene.masses), np.max(scene.masses)], float)
+    tiny, most = float(np.finfo(dtype).smallest_normal), float(np.finfo(dtype).max)
+    with np.errstate(all="ignore"):
+        power, light, heavy = spacing**2 * np.array([spacing**scene.dim, least, largest])
+    if not (tiny < power < most / 2**20 and tiny < light and heavy < most):  # far from its center, a kernel is small besides
+        raise SceneError(
+            f"spacing {spacing:g} m and masses from {least:g} to {largest:g} kg are beyond {np.dtype(dtype)} in sums over pairs: "
+            f"take {'' if dtype == np.float64 else 'float64, or '}units in which they are nearer to 1."
+        )
 
 
 def make_state(scene: Scene, dtype: type | None = None) -> State:

@@ -112,3 +112,12 @@ def test_a_solid_that_lies_beside_the_first_particles_is_taken(tmp_path):
     under = write_cube(tmp_path / "cube.stl", (0.02, 0.02, -0.05), 0.04)
     assert with_solid(block, under).solid.vertices.max(axis=0)[2] == pytest.approx(-0.03)
     refuses(SceneError, r"reaches from .*; move it there, or name the unit of the file", with_solid, block, under, 20.0)
+
+
+@pytest.mark.parametrize(("length", "mass"), [(1e-9, 1e-15), (1e10, 1e15), (1e-6, 1e-30), (1e6, 1e30)])
+def test_numbers_beyond_a_dtype_are_refused(length, mass):
+    """In float32 kernels of such lengths lose digits or are 0, and with them forces, without a word."""
+    scene = scene_of(length * POSITIONS, 0.1 * length, replace(PHYSICS, smoothing=0.15 * length), masses=np.full(5, mass))
+    assert make_model(scene, np.float64).m[0] == mass
+    message = "spacing .* m and masses from .* kg are beyond float32 in sums over pairs: take float64, or units"
+    refuses(SceneError, message, make_model, scene, np.float32)
