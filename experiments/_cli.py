@@ -28,7 +28,10 @@ def run(
     fills: Annotated[str | None, typer.Option(help="0.02,0.1: of all layouts, instead of the config's.")] = None,
     shard: Annotated[str, typer.Option(help="K/N: every N-th scene from the K-th on, in OUT/shard-K-of-N.")] = "1/1",
 ) -> None:
-    """Run a sweep, or go on with it: rows that are there are not measured again, unless less time cut their repeats short."""
+    """Run a sweep, or go on with it: rows that are there are not measured again, unless less time cut their repeats short.
+
+    Ends with status 1 where no row has a result.
+    """
     from experiments import _config, _sweep
 
     part, parts = _read_shard(shard)
@@ -39,6 +42,8 @@ def run(
     with _commands.stoppable():
         rows = _sweep.run(given, config.stem, folder, retry_failed, (part, parts))
     typer.echo(f"{_sweep.count_results(rows)}; rows in {folder / 'rows.jsonl'}")
+    if rows and not any(row.status == "ok" for row in rows):
+        raise typer.Exit(1)
 
 
 def _split(text: str | None) -> list[str] | None:
