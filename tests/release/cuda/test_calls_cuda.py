@@ -123,3 +123,16 @@ def test_calls_of_walls_and_of_few_are_read_and_planned():
     assert_planned(calls_of(of_walls, X))
     for way in WAYS.values():
         assert_planned(calls_of(way, X[:100]))
+
+
+@pytest.mark.skipif(jax.default_backend() != "gpu", reason="only on CUDA launches of a loop are recorded")
+@pytest.mark.parametrize(("way", "name"), list(each_way()))
+def test_on_a_gpu_a_loop_finds_what_single_calls_find(way, name):
+    """Arrays of a loop stay where they are, so that its launches are recorded; results of single calls are held, and do not."""
+    xs = jnp.asarray(X + np.random.default_rng(1).normal(scale=0.01, size=(12, *X.shape)).astype(np.float32))
+    call = lambda x: WAYS[way](x, **OPTIONS[name])  # noqa: E731
+    single = list(map(jax.jit(call), xs))
+    _, looped = jax.jit(lambda xs: jax.lax.scan(lambda k, x: (k, call(x)), 0, xs))(xs)
+    for k, each in enumerate(single):
+        of_loop = jax.tree.map(lambda leaf, k=k: leaf[k], looped)
+        jax.tree.map(lambda ours, its: np.testing.assert_allclose(ours, its, rtol=1e-5, atol=1e-6), of_loop, each)
