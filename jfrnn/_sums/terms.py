@@ -111,6 +111,7 @@ def trace(
     While the user's function `owner` lives, equal traces return the same term, so that compiled programs are reused.
     """
     closed = _jaxpr_of(summand, operands, shift)
+    _refuse_collectives(closed)
     consts = tuple(jnp.asarray(x) for x in closed.consts)
     of_consts = Groups(tuple(jax.ShapeDtypeStruct(x.shape, x.dtype) for x in consts), (), ())
 
@@ -157,6 +158,19 @@ def _keep(owner: object, derived: "Derived") -> "Derived":
         return _KNOWN.setdefault(owner, {}).setdefault(key, derived)
     except TypeError:  # an owner that cannot be a weak key is not cached
         return derived
+
+
+def _refuse_collectives(closed: ClosedJaxpr) -> None:
+    """Raise where a function asks other devices, or others of a batch, whose pairs are others; on a mesh it may ask where it is."""
+    mesh = jax.sharding.get_abstract_mesh().axis_names
+    for equation in (equation for each in _jaxprs(closed) for equation in each.jaxpr.eqns if not any(_inner(equation.params))):
+        name = equation.primitive.name
+        for axis in (effect.name for effect in equation.effects if type(effect).__name__ == "NamedAxisEffect"):
+            if name != "axis_index" or axis not in mesh:
+                raise TypeError(
+                    f"fn must not use {name} over the axis {axis!r}, along which each sum has pairs of its own: use it on what "
+                    "pair_sum returns, or before the call, and let fn close over the result."
+                )
 
 
 def _jaxprs(closed: ClosedJaxpr) -> Iterator[ClosedJaxpr]:

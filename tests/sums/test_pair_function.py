@@ -187,3 +187,22 @@ def test_rules_in_programs_that_close_over_what_moves_are_refused(within):
     np.testing.assert_allclose(jax.grad(work)(x, scale), jax.grad(of_a_rule)(x, scale, "jax"), rtol=1e-5)
     with pytest.raises(ValueError, match="hand that array over"):
         jax.jit(jax.grad(work, 1))(x, scale)
+
+
+@pytest.mark.parametrize("name", ["psum", "axis_index"])
+def test_functions_that_ask_others_of_a_batch_are_refused(name):
+    """The others have other pairs. A batch within the function is its own matter."""
+
+    def asking(r, i, j):
+        asked = jax.lax.psum(r @ r, "system") if name == "psum" else jax.lax.axis_index("system")
+        return jax.jit(lambda x: x * asked.astype(x.dtype))(r @ r)
+
+    def within(r, i, j):
+        return jax.vmap(lambda x: jax.lax.psum(x * x, "axis"), axis_name="axis")(r)[0]
+
+    def mapped(fn):
+        return jax.vmap(lambda x: jfrnn.pair_sum(fn, x, 1.0, backend="brute"), axis_name="system")(X[None])
+
+    with pytest.raises(TypeError, match=f"fn must not use {name} over the axis 'system'.*close over the result"):
+        mapped(asking)
+    assert not mapped(within).any()
