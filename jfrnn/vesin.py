@@ -7,6 +7,7 @@
 """
 
 import math
+import re
 from collections.abc import Callable
 from typing import Any
 
@@ -17,6 +18,7 @@ from jfrnn._ase import check_number, half_of, neighbor_list, primitive_neighbor_
 __all__ = ["NeighborList", "ase_neighbor_list"]
 
 Given = Any  # what users pass: numbers, arrays, lists
+_NAMES = {"positions": "points", "cell": "box", "pbc": "periodic"}  # what vesin calls the arguments of ASE
 _DTYPES = {"i": np.uint64, "j": np.uint64, "P": np.uint64, "S": np.int32}
 
 
@@ -77,9 +79,15 @@ class NeighborList:
             )
         given = np.asarray(points).dtype
         real = given if given.kind == "f" else np.dtype(np.float64)
-        return _arrays(
-            quantities, lambda names: primitive_neighbor_list(names, periodic, box, points, self.cutoff), real, self.full_list
-        )
+
+        def find(names: str) -> Given:
+            try:
+                return primitive_neighbor_list(names, periodic, box, points, self.cutoff)
+            except (TypeError, ValueError) as error:
+                told = re.sub(rf"\b({'|'.join(_NAMES)})\b", lambda name: _NAMES[name[0]], str(error))
+                raise type(error)(told) from error
+
+        return _arrays(quantities, find, real, self.full_list)
 
 
 def ase_neighbor_list(quantities: str, *args: Given, **kwargs: Given) -> tuple[np.ndarray, ...]:

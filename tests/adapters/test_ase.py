@@ -396,6 +396,14 @@ def test_forms_of_matscipy_and_vesin():
         refuses(ValueError, "at least 0", jfrnn.vesin.NeighborList, full_list=True, **bad)
     with pytest.raises(ValueError, match="quantities must be letters of 'ijPSDd'"):
         jfrnn.vesin.NeighborList(cutoff=2.0, full_list=True).compute(x, cell, True, "x")
+    for message, *given in (  # by the names that vesin has
+        ("box must be real numbers", x, None, False),
+        ("points must have shape .* and box", x[:, :2], cell, True),
+        ("periodic must be one bool or three", x, cell, [True, False]),
+        ("pass others, or periodic=False", x, np.zeros((3, 3)), True),
+        ("points must be finite", x * np.nan, cell, True),
+    ):
+        refuses((TypeError, ValueError), message, jfrnn.vesin.NeighborList(cutoff=2.0, full_list=True).compute, *given)
     refuses(TypeError, r"cutoff must be a number \[length\], got list", jfrnn.vesin.NeighborList, cutoff=["a"], full_list=True)
     refuses(ValueError, "algorithm must be", jfrnn.vesin.NeighborList, cutoff=2.0, full_list=True, algorithm="tree")
 
