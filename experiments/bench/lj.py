@@ -28,7 +28,7 @@ COLUMNS = (
 )
 SHOWN = ("n", "who", "skin", "steps", "steps_per_s", "ratio", "neighbors", "rebuilds", "drift", "temperature", "differs", "reason")
 
-Sizes = Annotated[list[int] | None, typer.Option(min=64, max=MOST_POINTS, help="Numbers of particles; may be said several times.")]
+Sizes = Annotated[list[int] | None, typer.Option(min=125, max=MOST_POINTS, help="Numbers of particles; may be said several times.")]
 Potential = Callable[[Array, Any], Array]  # of positions and what a way keeps; per particle
 
 

@@ -63,7 +63,7 @@ class Ran(NamedTuple):
 
 def make_crystal(n: int) -> Liquid:
     """Return about n particles on a cubic lattice, a little off their sites, with velocities of the temperature."""
-    rng, side = np.random.default_rng(n), max(round(n ** (1 / 3)), 4)
+    rng, side = np.random.default_rng(n), round(n ** (1 / 3))
     length = side / DENSITY ** (1 / 3)
     sites = np.stack(np.meshgrid(*[np.arange(side) + 0.5] * 3, indexing="ij"), -1).reshape(-1, 3)
     x = (sites + rng.uniform(-0.05, 0.05, sites.shape)) * (length / side)

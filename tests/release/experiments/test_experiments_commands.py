@@ -69,6 +69,7 @@ def test_list_says_what_there_is():
         (("bench", "structures", "--repeats", "1"), "--repeats 1: "),
         (("bench", "peers", "--limit", "nan"), "--limit nan: "),
         (("bench", "latency", "--sizes", "1"), "--sizes 1: "),
+        (("bench", "lj", "--sizes", "124"), "--sizes 124: "),  # narrower than two cutoffs
         (("bench", "latency", "--repeats", "1"), "--repeats 1: "),
         (("bench", "start", "--repeats", "0"), "--repeats 0: "),
         (("bench", "start", "--before", "none"), "--before none: is no checkout of this project; there is no jfrnn/__init__.py"),
