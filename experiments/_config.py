@@ -19,6 +19,7 @@ from experiments._errors import UsageError
 Positive = Annotated[FiniteFloat, Field(gt=0)]
 Timeout = Annotated[FiniteFloat, Field(gt=0, le=1e6)]  # [s]; the system waits no longer than some weeks
 Fill = Annotated[FiniteFloat, Field(gt=0, le=1)]
+Seed = Annotated[int, Field(ge=0, le=2**31 - 1)]
 Dtype = Literal["float32", "float64"]
 LIMITS = ("most_seconds", "timeout")  # when a row is given up, not what it measures
 
@@ -55,7 +56,7 @@ class Scenes(Table):
     """Instead of the config's spacing [m]."""
     cutoff_ratios: tuple[Positive, ...] = ()
     """Instead of the config's cutoff_ratio."""
-    seeds: tuple[Annotated[int, Field(ge=0)], ...] = ()
+    seeds: tuple[Seed, ...] = ()
     """Instead of the config's seed."""
     angles: tuple[FiniteFloat, ...] = ()
     """Of turnedN and cutN [degrees]."""
@@ -112,7 +113,7 @@ class Config(Repeats):
     """Of the positions."""
     dim: Literal[2, 3] = 3
     """Dimensions."""
-    seed: Annotated[int, Field(ge=0)] = 0
+    seed: Seed = 0
     """Of random layouts."""
     most_seconds: Positive = 60.0
     """No run begins when they took this long together, be they as few as they may [s]. Where a later sweep allows more, rows with
@@ -255,4 +256,5 @@ def _explain(item: ErrorDetails, kind: type[Table]) -> str:
         return f"{key}: missing; it must be given"
     if item["type"] == "value_error":
         return f"{key}: {item.get('ctx', {}).get('error')}"
-    return f"{key}: got {item['input']!r}; {item['msg'][0].lower()}{item['msg'][1:]}"
+    said = {"tuple_type": "input should be a list", "too_short": "the list should not be empty"}.get(item["type"], item["msg"])
+    return f"{key}: got {item['input']!r}; {said[0].lower()}{said[1:]}"

@@ -15,7 +15,7 @@ from pydantic import Field
 
 from experiments import _sweep
 from experiments._commands import RetryFailed, RowsFolder, take_folder
-from experiments._config import Dtype, LayoutName, Positive, Repeats, digest, load, one_of
+from experiments._config import Dtype, LayoutName, Positive, Repeats, Seed, digest, load, one_of
 from experiments._look import MARKERS, OURS, PEERS_COLORS, WIDTH, dress, factor, head, plain, write_names
 from experiments._loop import Shown, Task, fill
 from experiments._rows import RowFile
@@ -43,7 +43,7 @@ class Config(Repeats):
     most_points: dict[str, int] = Field(default_factory=dict)  # of ways that larger scenes are skipped for
     cutoff_ratio: Positive = 3.0  # cutoff in spacings
     dtype: Dtype = "float32"  # of the positions
-    seed: Annotated[int, Field(ge=0)] = 0  # of random layouts, and of what each particle contributes
+    seed: Seed = 0  # of random layouts, and of what each particle contributes
     min_seconds: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 1.0
 
     def specs(self) -> Iterator[dict[str, Any]]:

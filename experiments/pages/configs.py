@@ -32,7 +32,7 @@ def _type(of: dict[str, Any]) -> str:
         return " or ".join(json.dumps(value) for value in of["enum"])
     if of["type"] == "array":
         return f"list: {_type(of['items'])}"
-    return " ".join([of["type"], *(f"{words} {of[name]:g}" for name, words in _BOUNDS if name in of)])
+    return " ".join([of["type"], *(f"{words} {of[name]:.10g}" for name, words in _BOUNDS if name in of)])
 
 
 def example() -> str:
