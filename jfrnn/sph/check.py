@@ -40,7 +40,7 @@ def check_scene(scene: Scene) -> None:
         if place is not None:
             _check_corners(name, place.lower, place.upper, scene.dim)
     if scene.tank is not None:
-        _check_inside(scene.positions, scene.tank)
+        _check_inside(scene.positions, scene.tank, 0.01 * scene.spacing)
     if scene.bounds is not None and not np.isfinite([scene.bounds.lower, scene.bounds.upper]).all():
         raise SceneError(f"bounds must be finite, for they are what pictures show, got {scene.bounds}.")
     if scene.periodic is not None:
@@ -158,9 +158,9 @@ def _check_corners(name: str, lower: Sequence[float], upper: Sequence[float], di
         raise SceneError(f"{name} must reach from a lower to an upper corner, got {tuple(lower)!r} and {tuple(upper)!r}.")
 
 
-def _check_inside(positions: np.ndarray, tank: fluids.Tank) -> None:
-    """Refuse particles beyond a wall of the tank: the first step would put all of them onto it."""
-    outside = ((positions < np.asarray(tank.lower)) | (positions > np.asarray(tank.upper))).any(axis=1)
+def _check_inside(positions: np.ndarray, tank: fluids.Tank, most: float) -> None:
+    """Refuse particles more than `most` [m] beyond a wall, onto which the first step puts them; rounding leaves some nearer."""
+    outside = ((positions < np.asarray(tank.lower) - most) | (positions > np.asarray(tank.upper) + most)).any(axis=1)
     if outside.any():
         k = int(outside.argmax())
         raise SceneError(f"tank must hold all particles, but particle {k} is at {positions[k].tolist()} m, outside of {tank}.")

@@ -87,10 +87,11 @@ def make_model(scene: Scene, dtype: type | None = None, backend: str = "auto", *
             numbers are too large or too small for the dtype.
     """
     check_scene(scene)
-    _check_range(scene, choose_dtype(dtype))
+    dtype = choose_dtype(dtype)
+    _check_range(scene, dtype)
     if force is not None and not isinstance(force, jax.tree_util.Partial):
         force = jax.tree_util.Partial(force)
-    return kind_of(scene).make_model(scene, choose_dtype(dtype), backend, force)
+    return kind_of(scene).make_model(scene, dtype, backend, force)
 
 
 def _check_range(scene: Scene, dtype: type) -> None:

@@ -9,7 +9,7 @@ from poured import scene_of
 from test_sph_run import write_cube
 
 from jfrnn.cases import fluids
-from jfrnn.sph import check_scene, make_model, make_state, with_solid
+from jfrnn.sph import check_scene, make_model, make_scene, make_state, with_solid
 from jfrnn.sph.errors import SceneError
 
 PHYSICS = fluids.Physics(density=1000.0, sound_speed=10.0, smoothing=0.15, gravity=(0.0, -9.81))
@@ -112,6 +112,15 @@ def test_a_solid_that_lies_beside_the_first_particles_is_taken(tmp_path):
     under = write_cube(tmp_path / "cube.stl", (0.02, 0.02, -0.05), 0.04)
     assert with_solid(block, under).solid.vertices.max(axis=0)[2] == pytest.approx(-0.03)
     refuses(SceneError, r"reaches from .*; move it there, or name the unit of the file", with_solid, block, under, 20.0)
+
+
+def test_particles_that_float32_has_left_on_a_wall_are_taken():
+    """Whoever begins with the end of another run has them."""
+    block = make_scene("block", {})
+    x = block.positions.copy()
+    x[0, 1] = np.float32(block.tank.lower[1])
+    assert x[0, 1] < block.tank.lower[1]
+    check_scene(replace(block, positions=x))
 
 
 @pytest.mark.parametrize(("length", "mass"), [(1e-9, 1e-15), (1e10, 1e15), (1e-6, 1e-30), (1e6, 1e30)])
