@@ -16,6 +16,7 @@ from typer.core import TyperGroup
 from experiments._errors import UsageError
 
 MOST_POINTS = 100_000_000
+MOST_SEED = 2**31 - 1
 
 
 class Commands(TyperGroup):
@@ -190,7 +191,7 @@ Layout = Annotated[str, typer.Argument(help="Name of a layout, such as full, clu
 Fill = Annotated[float | None, typer.Option(callback=finite, help="Share of the full domain, above 0 and up to 1.")]
 Spacing = Annotated[float, typer.Option(min=1e-6, max=1.0, callback=finite, help="Distance of lattice neighbors [m].")]
 Dim = Annotated[int, typer.Option(min=2, max=3, help="Dimensions.")]
-Seed = Annotated[int, typer.Option(min=0, max=2**31 - 1, help="Seed of random layouts.")]
+Seed = Annotated[int, typer.Option(min=0, max=MOST_SEED, help="Seed of random layouts.")]
 RetryFailed = Annotated[bool, typer.Option("--retry-failed", help="Measure missing, failed and timed-out rows again.")]
 RowsFolder = Annotated[Path | None, typer.Option(help="Folder of the rows; out/NAME without it.")]
 Points = Annotated[int, typer.Option(min=100, max=MOST_POINTS, help="Random points.")]

@@ -14,12 +14,13 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, FiniteFloat, 
 from pydantic_core import ErrorDetails
 
 from experiments import _layouts, _rows, methods
+from experiments._commands import MOST_SEED
 from experiments._errors import UsageError
 
 Positive = Annotated[FiniteFloat, Field(gt=0)]
 Timeout = Annotated[FiniteFloat, Field(gt=0, le=1e6)]  # [s]; the system waits no longer than some weeks
 Fill = Annotated[FiniteFloat, Field(gt=0, le=1)]
-Seed = Annotated[int, Field(ge=0, le=2**31 - 1)]
+Seed = Annotated[int, Field(ge=0, le=MOST_SEED)]
 Dtype = Literal["float32", "float64"]
 LIMITS = ("most_seconds", "timeout")  # when a row is given up, not what it measures
 
