@@ -150,3 +150,6 @@ def test_functions_of_pairs_close_over_what_varies_over_a_mesh(backend):
     for fn in (summed, jax.grad(lambda x, length: summed(x, length).sum(), 1)):
         mapped = jax.shard_map(fn, mesh=mesh, in_specs=(PartitionSpec(), spec), out_specs=spec)
         np.testing.assert_array_equal(jax.jit(mapped)(X[0], lengths), fn(X[0], lengths))
+    total = lambda x: jfrnn.pair_sum(lambda r, i, j: jax.lax.psum(r @ r, "system"), x, CUTOFF, backend=backend)  # noqa: E731
+    with pytest.raises(TypeError, match="fn must not use psum over the axis 'system'"):
+        jax.shard_map(total, mesh=mesh, in_specs=PartitionSpec(), out_specs=spec)(X[0])
