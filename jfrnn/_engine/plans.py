@@ -238,7 +238,7 @@ def lay_plan(name: str, plan: Plan, shapes: Mapping[str, tuple[int, ...]], devic
     found.asked_words = 0 if plan.asked is None else math.prod(shapes[plan.asked])
     if found.asked_words > _MOST_ASKED:
         raise ValueError(f"{name} asks {found.asked_words} words, more than {_MOST_ASKED}")
-    # a single launch takes no longer than a graph of it: less of the host, and more of the device
+    # a graph of a single launch would take less of the host, but longer on the device
     if device >= 0 and plan.keep is None and len(laid) > 1 and all(step.kind in (_CUDA, _CUDA_BESIDE, _CLEAR) for step in laid):
         held.append(recorder := _make_recorder(device, plan.asked is not None))
         found.recorder = recorder and ctypes.addressof(recorder)
