@@ -40,6 +40,7 @@ class ListKind(NamedTuple):
         measured: Whether distances are asked for, beside which slots hold a pair.
         apart: Whether sums leave out a particle's pair with itself, without a shift.
         mirrored: Whether a term reads of i what stands beside the points, of the same number.
+        own: Whether rows are the sources, and are read among these.
     """
 
     kind: Kind
@@ -54,6 +55,7 @@ class ListKind(NamedTuple):
     measured: bool = False
     apart: bool = False
     mirrored: bool = False
+    own: bool = False
 
     @property
     def cuda(self) -> bool:
@@ -88,7 +90,7 @@ class ListKind(NamedTuple):
         """Return the named integers of a program."""
         found = {"CODE_BYTES": self.code_bytes, "REVERSED": self.reversed, "ALIGNED": self.aligned, "ORDERED": self.ordered}
         found |= {"DECIDED": 1, "MEASURED": self.measured, "APART": self.apart, "MIRRORED": self.mirrored, "OWN": 0}
-        found |= {"BOXES": self.boxes, "ITSELF": self.itself, "LENGTH": self.length(columns)}
+        found |= {"BOXES": self.boxes, "ITSELF": self.itself, "OWN_ROWS": self.own, "LENGTH": self.length(columns)}
         return found | {"LANES_PER_ROW": max(self.lanes, 1), "QUERY_CHUNK": ROWS_AT_ONCE}
 
 

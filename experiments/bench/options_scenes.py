@@ -154,7 +154,7 @@ def _two(rule: str, n: int) -> Asked:
 
 def _species(n: int) -> Asked:
     r, kinds = _radius(n), np.random.default_rng(1).integers(0, 2, n)
-    cutoffs = jnp.asarray([[r, 0.75 * r], [0.75 * r, 0.5 * r]], jnp.float32)
+    cutoffs = [[r, 0.75 * r], [0.75 * r, 0.5 * r]]  # known, as one cutoff is
     return Asked(jnp.asarray(_uniform(n)), cutoffs, {"species": jnp.asarray(kinds, jnp.int32)})
 
 

@@ -32,7 +32,7 @@ class KeptList(NamedTuple):
         counts: [m] int32 true counts.
         codes: Image codes [m, capacity], or None.
         sources: Positions [n, d].
-        rows: Positions of the rows [m, d].
+        rows: Positions of the rows [m, d]; None: they are the sources.
         turns: Lattice vectors between the cell and the sources and the rows, in whole floats [n, d] and [m, d], with codes.
         cutoff: One for all, or one per particle.
         lattice: The box, or one per system, or None.
@@ -47,7 +47,7 @@ class KeptList(NamedTuple):
     counts: Array
     codes: Array | None
     sources: Array
-    rows: Array
+    rows: Array | None
     turns: tuple[Array, Array] | None
     cutoff: Cutoff | Cutoffs
     lattice: Lattice | None
@@ -55,6 +55,11 @@ class KeptList(NamedTuple):
     reversal: tuple[Array, Array, Array] | None
     systems: tuple[Array, Array] | None = None
     numbers: Array | None = None
+
+    @property
+    def ends(self) -> tuple[Array, Array]:
+        """Positions of the sources and of the rows."""
+        return self.sources, self.sources if self.rows is None else self.rows
 
 
 def kept_mask(given: KeptList) -> Array:
@@ -112,7 +117,7 @@ def kept_sums(given: KeptList, summed: Summed, values: tuple[Array, Array | None
         def call(given: KeptList, values: tuple[Array, Array | None, Array]) -> FoundSums:
             shared, own, others = values
             own = jnp.zeros((1, 1), given.sources.dtype) if own is None else own
-            rows = (given.sources if given.reversal is not None else given.rows).shape[0]
+            rows = len(given.ends[given.reversal is None])
             kind = _kind_of(given, cuda)._replace(apart=apart, mirrored=mirrored)
             kind = kind._replace(lanes=kept.lanes_of_sums(rows)) if cuda else kind
             kind = kind._replace(kind=summed.of(kind.kind))
@@ -147,6 +152,7 @@ def _kind_of(given: KeptList, cuda: bool) -> ListKind:
         lanes=kept.LANES if cuda else 0,
         boxes=given.systems is not None,
         itself=isinstance(cutoff, Cutoffs) and cutoff.itself,
+        own=given.rows is None and not rule,
     )
 
 
@@ -155,12 +161,12 @@ def _operands(given: KeptList, kind: ListKind, columns: int, others: Array | Non
 
     `slots` are the reverse slots of a list that is not itself reversed.
     """
-    dtype, sources, rows, turns = given.sources.dtype, given.sources, given.rows, given.turns or (None, None)
+    dtype, (sources, rows), turns = given.sources.dtype, given.ends, given.turns or (None, None)
     if kind.reversed:
         sources, rows, turns = rows, sources, turns[::-1]
     of_sources, of_rows = _radii_of(given, kind)
     points = _beside(kind.length(columns), sources, others if columns else None, turns[0], of_sources, more=1)
-    own = _beside(kind.own_length, rows, turns[1], of_rows)
+    own = jnp.zeros((1, 1), dtype) if kind.own else _beside(kind.own_length, rows, turns[1], of_rows)
     cutoff = given.cutoff.largest if isinstance(given.cutoff, Cutoffs) else given.cutoff.radius
     nothing, steps = jnp.zeros(1, jnp.int32), jnp.zeros(1, dtype)
     if given.lattice is not None and given.codes is not None:
@@ -203,7 +209,7 @@ def _radii_of(given: KeptList, kind: ListKind) -> tuple[Array | None, Array | No
         beside, own = both[::-1] if kind.reversed else both
         dtype = given.sources.dtype
         return beside.astype(dtype), (own * np.int32(len(table))).astype(dtype)
-    both = zip((given.cutoff.sources, given.cutoff.queries), (given.sources, given.rows), strict=True)
+    both = zip((given.cutoff.sources, given.cutoff.queries), given.ends, strict=True)
     found = [jnp.zeros(len(points), points.dtype) if x is None else x for x, points in both]
     return (found[1], found[0]) if kind.reversed else (found[0], found[1])
 
@@ -237,7 +243,7 @@ def _sum_callable(kind: ListKind, term: TermText, key: str) -> Call:
 
 def _launch(kind: ListKind, found: Kernel, shapes: Shapes) -> Plan:
     (m, capacity), n = shapes["idx"], shapes["points"][0] - 1
-    m = shapes["rows"][0] if kind.reversed else m
+    m = m if not kind.reversed else n if kind.own else shapes["rows"][0]
     numbers = {"m": m, "n": n, "capacity": capacity, "images": kind.images, "closed": int(kind.kind.closed)}
     launch = Launch(found, kept.threads(m, kind.lanes)) if kind.cuda else share(found, m, kept.ROWS_AT_ONCE)
     return Plan([launch] if kind.cuda else [Clear("info", 8), launch], numbers)

@@ -135,6 +135,8 @@ def by_cells_or_tree(cells: Callable[..., Found], tree: Callable[..., Found], se
         return tree(search, *more)
 
     cutoffs = of_cells.cutoffs
+    if cutoffs.alike and (kinds := cutoffs.kinds) is not None and len(kinds[0]) <= cells_cuda.MOST_KINDS:
+        return by_cells(search, cutoffs.largest, cutoffs.longer, *more)
     return lax.cond(cutoffs_are_alike(of_cells), by_cells, by_tree, search, cutoffs.largest, cutoffs.longer, *more)
 
 

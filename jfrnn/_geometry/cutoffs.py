@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
+from jax.core import Tracer
 
 from jfrnn._geometry.floats import two_sum, unit_scale
 from jfrnn._tracing import portable
@@ -16,6 +17,7 @@ Flags = Any  # bool array of NumPy or JAX, like the argument
 RULES = ("gather", "scatter", "either", "both", "mean")  # cutoff of a pair: i's, j's, larger, smaller, mean
 SUM = "sum"  # a rule of users: the mean of doubled radii, exactly
 TABLE = "table"  # a rule of pairs of species
+ALIKE = 2  # species that reach as far as each other within this factor are searched by cells, wherever particles are
 # the smallest cutoff whose band of step 1 covers flushed denormals, and the largest whose cell edge is finite
 RANGE_OF = {
     np.dtype(x.dtype): (2.0 ** (x.minexp + x.nmant + 7), 2.0 ** (x.maxexp - 1)) for x in map(np.finfo, (np.float32, np.float64))
@@ -77,6 +79,7 @@ class Radii:
         summed: Whether they are twice the radii that the user gave, whose sum is then their mean. Static.
         table: [s, s] cutoffs of pairs of species, 0 for those that are no neighbors; None with cutoffs per particle.
         itself: Whether each particle is its own neighbor, whatever its cutoff. Static.
+        alike: Whether species are known to reach almost as far as each other: by a factor of `ALIKE`. Static.
     """
 
     sources: Array | None
@@ -85,6 +88,13 @@ class Radii:
     summed: bool = dataclasses.field(default=False, metadata={"static": True})
     table: Array | None = None
     itself: bool = dataclasses.field(default=False, metadata={"static": True})
+    alike: bool = dataclasses.field(default=False, metadata={"static": True})
+
+    def with_table(self, table: Array) -> "Radii":
+        """Return them with these cutoffs of pairs of species."""
+        farthest = None if isinstance(table, Tracer) else np.asarray(jax.device_get(table)).max(axis=1)
+        alike = farthest is not None and bool(ALIKE * farthest.min() >= farthest.max())
+        return dataclasses.replace(self, table=table, alike=alike)
 
     @property
     def asked(self) -> str:
@@ -112,6 +122,7 @@ class Cutoffs:
         kinds: With a table, the cutoffs of pairs of species, [s, s], -1 for those that are no neighbors, and the species of the
             sources and of the queries. The cutoff of a particle is then the largest one of its species. Otherwise None.
         itself: Whether each particle is its own neighbor, whatever its cutoff. Static.
+        alike: As in `Radii`. Static.
         longer: [] how many queries have longer cutoffs than `largest`, if there may be some.
     """
 
@@ -123,6 +134,7 @@ class Cutoffs:
     closed: bool = dataclasses.field(metadata={"static": True})
     kinds: tuple[Array, Array, Array] | None = None
     itself: bool = dataclasses.field(default=False, metadata={"static": True})
+    alike: bool = dataclasses.field(default=False, metadata={"static": True})
     longer: Array | None = None
     scaled = True
 
@@ -205,7 +217,7 @@ def _make_cutoffs_of_kinds(radii: Radii, given: Array, closed: bool, skin: float
     largest = jnp.max(farthest, initial=0)
     largest = jnp.where(largest > 0, largest, 1)
     named, scale = (table, kinds[0], kinds[1]), unit_scale(largest)
-    return Cutoffs(farthest[kinds[0]], farthest[kinds[1]], largest, scale, TABLE, closed, named, radii.itself)
+    return Cutoffs(farthest[kinds[0]], farthest[kinds[1]], largest, scale, TABLE, closed, named, radii.itself, radii.alike)
 
 
 def are_valid(radii: Radii) -> tuple[Array | None, Array | None]:

@@ -211,7 +211,7 @@ def check_species(cutoff: Given, species: Given, rule: object, sources: Array, q
         wrong = known[(known < 0) | (known >= len(table))]
         if wrong.size:
             raise ValueError(f"{name} must be numbers of species from 0 to {len(table) - 1}, the rows of cutoff, got {wrong[0]}.")
-    return Radii(of_sources, of_queries, TABLE, table=table)
+    return Radii(of_sources, of_queries, TABLE).with_table(table)
 
 
 def check_table(cutoff: Given, like: Array, kinds: int | None = None) -> Array:

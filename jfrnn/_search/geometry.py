@@ -191,11 +191,9 @@ def vectors_of(present: Present, as_given: bool = False) -> tuple[Array, Array, 
 def kept_list(present: Present) -> KeptList:
     """Return a list as Warp's kernels take it: points near the box, and one lattice, or one per system; all are constants."""
     topology, systems, turns, lattice = present.topology, None, None, None
-    sources, rows = lax.stop_gradient((present.sources, present.rows))
+    sources, rows = lax.stop_gradient((present.sources, present.queries))
     if present.box is not None and present.kind is not None:
-        apart = None if present.rows is present.sources else rows
-        sources, rows, turns, lattice, systems = _near_box(sources, apart, present.box, present.batch, present.images, present.kind)
-        rows = sources if rows is None else rows
+        sources, rows, turns, lattice, systems = _near_box(sources, rows, present.box, present.batch, present.images, present.kind)
     fixed = lax.stop_gradient((sources, rows, turns, present.cutoffs, lattice))
     return KeptList(topology.idx, present.count, topology.codes, *fixed, topology.order, None, systems)
 
@@ -224,7 +222,8 @@ def kept_shifts(given: KeptList) -> Array:
     used = given.idx < given.sources.shape[0]
     neighbor = jnp.where(used, given.idx, 0)
     if given.codes is None or given.turns is None:
-        shifts = geometry.nearest_shifts(given.sources[neighbor] - given.rows[:, None, :], lattice)
+        sources, rows = given.ends
+        shifts = geometry.nearest_shifts(sources[neighbor] - rows[:, None, :], lattice)
     else:
         shifts = _shifts_of_codes(given.codes, used, lattice.images, given.turns[1][:, None], given.turns[0][neighbor])
     return jnp.where(used[..., None], shifts, 0)

@@ -289,7 +289,8 @@ class KeptSearch(KeptOptions):
             kind, batch = problem.options.images, self.batch
             forward = problem.options.filter.later_only and kind is not None and kind.counts_short
         made = None if images is None or self.verlet is None else (self.verlet.positions, self.verlet.queries)
-        return Present(topology, count, (images, made), sources, rows, box, batch, cutoff, kind, closed, forward)
+        queries = rows if problem.own_queries else None
+        return Present(topology, count, (images, made), sources, queries, box, batch, cutoff, kind, closed, forward)
 
     def _geometry_inputs(
         self, positions: Points, queries: Points | None, box: geometry.Box | None

@@ -33,7 +33,7 @@ def lengths(present: Present) -> tuple[Array, Array]:
 
 
 def _at(sources: Array, box: Box | None, fixed: Present) -> Present:
-    return dataclasses.replace(fixed, sources=sources, rows=sources, box=box)
+    return dataclasses.replace(fixed, sources=sources, box=box)
 
 
 def _find(sources: Array, box: Box | None, fixed: Present) -> tuple[Array, Array]:
@@ -57,7 +57,7 @@ def _move(primals: tuple, tangents: tuple) -> tuple[list[Array], list[Any]]:
         return [distances, mask], [still(distances), none]
     fixed = kept_list(_at(sources, box, present))
     near = sources if fixed.lattice is None else bring_near(sources, fixed.lattice).points
-    lines = fixed._replace(sources=near, rows=near), present.topology, distances
+    lines = fixed._replace(sources=near), present.topology, distances
     return [distances, mask], [bind(_along_p, moved, lines), none]
 
 

@@ -186,7 +186,7 @@ class Present:
         count: True number of neighbors of each row, [m]; of a flat list, that of its pairs, [].
         images: The images of the slots, and where points were when the list was made; (None, None) if a pair has one image.
         sources: Positions of the sources [n, d].
-        rows: Positions of the rows [m, d].
+        queries: Positions of the rows [m, d]; None: they are the sources.
         box: The present box, or None.
         batch: The systems of the particles, of which each may have a box; None in open space.
         cutoff: That of the pairs; None: all pairs of the list are.
@@ -199,13 +199,18 @@ class Present:
     count: Array
     images: ImagesMade
     sources: Array
-    rows: Array
+    queries: Array | None
     box: Box | None
     batch: Batch | None
     cutoff: Cutoff | Radii | None
     kind: Images | None = dataclasses.field(metadata={"static": True})
     closed: bool = dataclasses.field(metadata={"static": True})
     forward: bool = dataclasses.field(metadata={"static": True})
+
+    @property
+    def rows(self) -> Array:
+        """Positions of the rows [m, d]."""
+        return self.sources if self.queries is None else self.queries
 
     @property
     def native(self) -> bool:

@@ -259,7 +259,9 @@ def find_fields(
     offsets, found = engine.list_flat(inputs, options, room) if flat else (None, engine.find_rows(inputs, options, room))
     rows, n, verlet, reverse = found.rows, len(inputs.sources), None, None
     images = None if found.images is None or found.turns is None else ImageCodes(found.images, found.turns[0], found.turns[1])
-    radii = lax.stop_gradient(inputs.cutoff) if isinstance(inputs.cutoff, geometry.Radii) else None
+    radii = None
+    if isinstance(inputs.cutoff, geometry.Radii):  # as if no table were known: where it is not, a loop may hand on another list
+        radii = dataclasses.replace(lax.stop_gradient(inputs.cutoff), alike=False)
     if moving:
         sources = engine.hide_inactive(inputs.sources, engine.take_present(inputs).active)
         verlet = first_verlet(sources, inputs.queries, inputs.box, options.images, radii, inputs.batch)

@@ -207,7 +207,7 @@ def extremes_of_list(
 
 def _values_of_list(given: engine.KeptList, plan: Plan, term: Term, operands: Groups) -> tuple[Array, Array | None, Array]:
     """Return the columns of what all pairs share, of i, and of j; None for i where those are of the same arrays."""
-    n, m = (len(x) for x in (given.sources, given.rows)[:: 1 if given.reversal is None else -1])
+    n, m = (len(x) for x in given.ends[:: 1 if given.reversal is None else -1])
     of_i, of_j = (
         [(labels[k], e) for k, e in columns] for labels, columns in zip(term.labels, (plan.own, plan.others), strict=True)
     )

@@ -105,7 +105,7 @@ def pairs_of_list(
         relation = dataclasses.replace(relation, given=relation.given._replace(numbers=known.pairs))
     lattice, sides = _lattice(box, nbrs.box_kind, sources, nbrs.batch)
     if isinstance(relation, Kept) and not any(isinstance(x, Tracer) for x in jax.tree.leaves((sources, rows, box))):
-        sources, rows = relation.given.sources, relation.given.rows  # no derivative is taken
+        sources, rows = relation.given.ends  # no derivative is taken
     else:
         sources, asking = _bring_near(sources, rows if own else None, box, nbrs.box_kind, nbrs.batch)
         rows = sources if asking is None else asking

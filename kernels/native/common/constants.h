@@ -57,6 +57,7 @@ constexpr bool APART = true;      // particles are no neighbors of their own
 constexpr int LANES_PER_ROW = 8;  // of CUDA
 constexpr bool DECIDED = true;    // which of its slots hold a pair
 constexpr bool MIRRORED = false;  // a term reads of i what it reads of j
+constexpr bool OWN_ROWS = true;   // rows are the sources
 constexpr bool MEASURED = false;  // distances are written, too
 constexpr int ROW_BLOCKS = 8;     // of rows whose derivatives are summed by themselves, on the CPU
 constexpr bool BOXES = false;     // each system has a lattice of its own

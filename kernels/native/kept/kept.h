@@ -1,11 +1,11 @@
 // Which slots of a list that is kept hold a pair now: one text for a slot, on CUDA, and for LANES of them, on the CPU.
 //
 // Rows of the list have OWN_LENGTH numbers: coordinates as they are, then turns along each axis (PERIODIC == 2), then the cutoff of i
-// (DIFFER). Sources have LENGTH: coordinates, OTHERS numbers that a term reads, turns and the cutoff of j. `cutoff` holds the largest
-// cutoff, the lattice, and the largest number of a shift. BOXES: it has such numbers for each of several systems, of which `systems` says
-// to which a row belongs. `steps` are the shifts of image codes, or a 0 where there are none, and behind them the cutoffs of pairs of
-// species behind how many there are, -1 for those that are no neighbors; in place of cutoffs then stand the first place of the row of i,
-// and the species of j. REVERSED:
+// (DIFFER). Sources have LENGTH: coordinates, OTHERS numbers that a term reads, turns and the cutoff of j. OWN_ROWS: rows are the
+// sources, whose numbers are theirs, too; no cutoffs differ. `cutoff` holds the largest cutoff, the lattice, and the largest number of
+// a shift. BOXES: it has such numbers for each of several systems, of which `systems` says to which a row belongs. `steps` are the
+// shifts of image codes, or a 0 where there are none, and behind them the cutoffs of pairs of species behind how many there are, -1
+// for those that are no neighbors; in place of cutoffs then stand the first place of the row of i, and the species of j. REVERSED:
 // rows are those of the sources of the list, whose slots are `lengths` many in `slots` from `starts` on, and j is who has such a slot.
 // ORDERED: threads take rows as `order` has them, so that rows that are taken together read the same sources, or as they come where it
 // holds -1. APART: a particle's pair with itself, without a shift, is left out. ITSELF: it is a pair, whatever the cutoff.
@@ -123,11 +123,11 @@ struct Kept : KeptArguments, Space {
     };
     JFRNN_MEMBER OwnPoint own_point(int row) const {
         OwnPoint own{{0, 0, 0}, {0, 0, 0}, 0};
-        const real* const from = rows + (long long)OWN_LENGTH * row;
+        const real* const from = OWN_ROWS ? points + (long long)LENGTH * row : rows + (long long)OWN_LENGTH * row;
         for (int k = 0; k < DIM; ++k) {
             own.q[k] = from[k];
             if constexpr (CODED)
-                own.turn[k] = from[OWN_TURNS + k];
+                own.turn[k] = from[(OWN_ROWS ? TURNS : OWN_TURNS) + k];
         }
         if constexpr (DIFFER)
             own.radius = from[OWN_RADIUS];

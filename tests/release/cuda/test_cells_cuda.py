@@ -6,6 +6,7 @@ What they answer is decided on a GPU: python -m experiments gpu experiments/conf
 import itertools
 
 import jax
+import jax.numpy as jnp
 import launched
 import numpy as np
 import pytest
@@ -191,3 +192,27 @@ def test_kernels_share_queries_as_launches_do():
     found = np.zeros((len(queries), 2), np.int32)
     launched.on_cpu(count, queries=queries, shared=found, n=len(queries))
     assert found.tolist() == [[cells_cuda.share_bits(m), cells_cuda.query_blocks(m)] for m in queries.tolist()]
+
+
+def test_of_known_tables_the_host_asks_nothing():
+    """Where cutoffs of species are known and alike, cells serve, and no sample is waited for; a loop may hand on such a list."""
+    x, species = jnp.asarray(np.random.default_rng(0).random((5000, 3)).astype(np.float32)), np.arange(5000, dtype=np.int32) % 2
+
+    def chooses(table, given=None):
+        counted = jax.jit(lambda x, given: jfrnn.count(x, table if given is None else given, species=species, backend="warp"))
+        return "stablehlo.case" in counted.trace(x, given).lower(lowering_platforms=("cuda",)).as_text()
+
+    table = np.array([[0.1, 0.07], [0.07, 0.05]])
+    assert not chooses(table) and not chooses(table.tolist())
+    assert chooses(np.array([[0.1, 0.01], [0.01, 0.04]])) and chooses(None, jnp.asarray(table, jnp.float32))
+
+    first = jfrnn.search(x, table, species=species, backend="warp", slack=1.5)
+
+    @jax.jit
+    def again(first, table):
+        def step(nbrs, x):
+            return jfrnn.search(x, table, species=species, capacity=nbrs.capacity, backend="warp"), nbrs.count
+
+        return jax.lax.scan(step, first, jnp.stack([x, x]))[1]
+
+    np.testing.assert_array_equal(again(first, jnp.asarray(table, jnp.float32))[1], first.count)
