@@ -31,6 +31,7 @@ Handle = Any  # of a program that is loaded, by Clang or by CUDA
 _FOLDER = "wp_jfrnn"
 _END = b"\n//"  # a comment of PTX, and nothing to objects
 _DIGEST = 64  # hexadecimal digits
+_WITH_CONDITIONS = ".version 8.3"  # the PTX of CUDA 12.3, whose drivers are the first that know conditions of graphs
 _ROOM = 1 << 22  # bytes that a compiler may need
 _ATTEMPTS = 10
 Build = Callable[[Program, Path], Path]
@@ -280,12 +281,22 @@ def _build_object(options: Sequence[str], program: Program, source: Path) -> Pat
 
 def _build_cuda(device: _driver.CudaDevice | None, arch: int | None, program: Program, source: Path) -> Path:
     """Compile for a device, to PTX if NVRTC does not know it yet; or to PTX for an architecture in its place."""
+    if program.linked:
+        return _build_linked(program, source)
     known, asked = _nvrtc.known_archs(), device.arch if arch is None and device is not None else arch or 0
     fitting = [each for each in known if each <= asked]
     if not fitting:
         raise RuntimeError(f"the compiler that Warp ships knows the compute capabilities {list(known)}, none of which fits {asked}")
     binary = source.with_suffix(".cubin" if arch is None and fitting[-1] == asked else ".ptx")
     _nvrtc.compile_cuda(program.text, source.name, binary, fitting[-1], program.fused)
+    return binary
+
+
+def _build_linked(program: Program, source: Path) -> Path:
+    """Compile to PTX of any device. Drivers link it that are older than the compiler, if it names a version that they know."""
+    binary = source.with_suffix(".ptx")
+    _nvrtc.compile_cuda(program.text, source.name, binary, _nvrtc.known_archs()[0], program.fused)
+    binary.write_text(re.sub(r"^\.version .*$", _WITH_CONDITIONS, binary.read_text("utf-8"), count=1, flags=re.MULTILINE), "utf-8")
     return binary
 
 

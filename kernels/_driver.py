@@ -65,50 +65,6 @@ def find_device(number: int) -> CudaDevice:
     return CudaDevice(number, context.value or 0, 10 * major + minor, multiprocessors)
 
 
-# A kernel of one block of 256 that lets a graph go on if a word is not 0; the driver knows the function that it calls.
-_DECIDE = b"""
-.version 6.0
-.target sm_50
-.address_size 64
-.extern .func cudaGraphSetConditional (.param .b64 condition, .param .b32 value);
-.visible .entry decide (.param .u64 condition, .param .u64 words, .param .u32 count)
-{
-    .reg .b64 %condition, %words, %at;
-    .reg .b32 %k, %count, %word, %found;
-    .reg .pred %ends, %any;
-    ld.param.u64 %condition, [condition];
-    ld.param.u64 %words, [words];
-    ld.param.u32 %count, [count];
-    cvta.to.global.u64 %words, %words;
-    mov.u32 %k, %tid.x;
-    mov.u32 %found, 0;
-next:
-    setp.ge.u32 %ends, %k, %count;
-    @%ends bra all;
-    mul.wide.u32 %at, %k, 4;
-    add.u64 %at, %words, %at;
-    ld.global.u32 %word, [%at];
-    or.b32 %found, %found, %word;
-    add.u32 %k, %k, 256;
-    bra next;
-all:
-    setp.ne.u32 %any, %found, 0;
-    bar.red.or.pred %any, 0, %any;
-    selp.u32 %found, 1, 0, %any;
-    mov.u32 %k, %tid.x;
-    setp.ne.u32 %ends, %k, 0;
-    @%ends bra end;
-    {
-        .param .b64 to_condition;
-        .param .b32 to_value;
-        st.param.b64 [to_condition], %condition;
-        st.param.b32 [to_value], %found;
-        call.uni cudaGraphSetConditional, (to_condition, to_value);
-    }
-end:
-    ret;
-}
-"""
 # Functions of the driver that record launches in a graph behind a condition (CUDA 12.3), by the names of native code.
 GRAPHS = {
     "make_graph": "cuGraphCreate",
@@ -128,15 +84,6 @@ GRAPHS = {
 def has_graphs() -> bool:
     """Say whether the driver has all that records launches."""
     return all(hasattr(driver(), name) for name in GRAPHS.values())
-
-
-@functools.cache
-def find_decider(device: CudaDevice) -> int | None:
-    """Return the handle of the function that decides whether a graph goes on, None where a driver has no such graphs."""
-    if not has_graphs():
-        return None
-    module = load_module(device, _DECIDE)
-    return None if module is None else find_function(module, "decide") or None
 
 
 def load_module(device: CudaDevice, binary: bytes) -> int | None:

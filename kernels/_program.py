@@ -31,7 +31,7 @@ class Program(NamedTuple):
     """A text that is compiled as a whole, for the CPU or for CUDA.
 
     `fused`: products may be contracted with sums. `inlined`: large functions, too, become part of those that call them, as loops
-    over many pairs want it (CPU).
+    over many pairs want it (CPU). `linked`: it calls a function that the driver links (CUDA).
     """
 
     name: str
@@ -39,6 +39,7 @@ class Program(NamedTuple):
     cuda: bool
     fused: bool = False
     inlined: bool = True
+    linked: bool = False
 
 
 class Field(NamedTuple):
@@ -91,7 +92,9 @@ class Entry(NamedTuple):
         return self.called or self.method.replace(".", "_")
 
 
-def declare(name: str, text: str, *entries: Entry | str, cuda: bool = False, fused: bool = False) -> list[Kernel]:
+def declare(
+    name: str, text: str, *entries: Entry | str, cuda: bool = False, fused: bool = False, linked: bool = False
+) -> list[Kernel]:
     """Return the kernels of a program.
 
     Args:
@@ -100,6 +103,7 @@ def declare(name: str, text: str, *entries: Entry | str, cuda: bool = False, fus
         entries: The methods that are launched.
         cuda: Whether it is compiled for CUDA, or for the CPU.
         fused: Whether products may be contracted with sums.
+        linked: Whether a function of the driver is called.
     """
     called = [Entry(entry) if isinstance(entry, str) else entry for entry in entries]
     given = [_find_arguments(text, entry.method.split(".")[0]) for entry in called]
@@ -107,7 +111,7 @@ def declare(name: str, text: str, *entries: Entry | str, cuda: bool = False, fus
     found = [read_fields(text, arguments) for arguments in given]
     checks = dict.fromkeys(_write_check(arguments, *read) for arguments, read in zip(given, found, strict=True))
     whole = "\n".join([resolve("c_library.h"), "namespace {", text, _UNWARNED[cuda], *checks, "}", *lines, ""])
-    program = Program(name, whole, cuda, fused)
+    program = Program(name, whole, cuda, fused, linked=linked)
     return [Kernel(program, x.name, fields, size, x.block) for x, (fields, size) in zip(called, found, strict=True)]
 
 

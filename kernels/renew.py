@@ -14,12 +14,13 @@ MOST_TURNS = (0, *((1 << k) - 1 for k in range(1, 10)))  # how far rounding goes
 
 
 class RenewKernels(NamedTuple):
-    """What says whether a list is stale; what comes before a search, and behind it."""
+    """What says whether a list is stale; what comes before a search, and behind it; and what lets a graph go on if it is stale."""
 
     check: Kernel
     prepare: Kernel
     settle: Kernel
     keep: Kernel
+    decide: Kernel
 
 
 def blocks(n: int) -> int:
@@ -32,10 +33,16 @@ def renew_kernels(dim: int, double: bool, periodic: bool, ordered: bool, told: t
     """Return the kernels for a dimension, a dtype and a space; `told` are constants that other floors decide, with their names."""
     kind = Kind(dim, double, periodic=periodic)
     first, words, word = place_words(2 if double else 1)
-    constants = {"ORDERED": ordered, "FIRST_PLACE": first, "PLACE_WORDS": words, "PLACE_WORD": word, "BLOCK": BLOCK}
-    text = program(kind, "renew.cuh", constants=constants | dict(told))
-    entries = [Entry(f"Renew.{method}", BLOCK, 4) for method in RenewKernels._fields]
-    return RenewKernels(*declare(f"renew_cuda_{kind.name}{'_ordered' * ordered}", text, *entries, cuda=True))
+    constants = {"ORDERED": ordered, "FIRST_PLACE": first, "PLACE_WORDS": words, "PLACE_WORD": word, "BLOCK": BLOCK, **dict(told)}
+    name = f"renew_cuda_{kind.name}{'_ordered' * ordered}"
+    check, *rest = (Entry(f"Renew.{method}", BLOCK, 4) for method in RenewKernels._fields[:-1])
+
+    def text(conditional: bool) -> str:
+        return program(kind, "renew.cuh", constants=constants | {"CONDITIONAL": conditional})
+
+    around = declare(name, text(conditional=False), check, *rest, cuda=True)
+    decide = declare(f"{name}_conditional", text(conditional=True), check, cuda=True, linked=True)
+    return RenewKernels(*around, *decide)
 
 
 @functools.lru_cache(64)

@@ -74,6 +74,7 @@ class Plan(NamedTuple):
         absent: Arrays that no kernel touches, though it names them.
         keep: The number of a CUDA device, or -1 -> what is kept there for all calls, which take turns then.
         asked: The name of an array of int32, on CUDA: the first step writes it, and others are launched if a word is not 0.
+        decide: With `asked`, the kernel of the first step as one that sets its argument `condition`, that of a graph.
         same: The names of arguments that are other arrays of the call, by the names of these.
     """
 
@@ -82,6 +83,7 @@ class Plan(NamedTuple):
     absent: Sequence[str] = ()
     keep: Callable[[int], Kept] | None = None
     asked: str | None = None
+    decide: Kernel | None = None
     same: Mapping[str, str] = {}
 
 
@@ -98,7 +100,8 @@ def ask_for_huge_pages(array: str, size: int) -> list[HugePages]:
 def begin_programs(plan: Plan, device: int) -> list[Future[Path]]:
     """Let threads compile what a plan launches on a device, and no file keeps; return what waits for them."""
     # what is launched last takes longest to compile
-    programs = dict.fromkeys(step.kernel.program for step in reversed(plan.steps) if isinstance(step, Launch))
+    kernels = [step.kernel for step in reversed(plan.steps) if isinstance(step, Launch)] + [plan.decide] * (plan.decide is not None)
+    programs = dict.fromkeys(kernel.program for kernel in kernels)
     begun = [compiler().begin(program, _place(program, device)) for program in programs]
     return [job for job in begun if job is not None]
 
@@ -139,6 +142,7 @@ class _Recorder(ctypes.Structure):
         ("stream", ctypes.c_void_p),
         ("context", ctypes.c_void_p),
         ("decide", ctypes.c_void_p),
+        ("condition", ctypes.c_int),
         ("recorded", _Recorded * _MOST_RECORDED),
         ("turn", ctypes.c_uint),
         ("locked", ctypes.c_int),
@@ -240,7 +244,11 @@ def lay_plan(name: str, plan: Plan, shapes: Mapping[str, tuple[int, ...]], devic
         raise ValueError(f"{name} asks {found.asked_words} words, more than {_MOST_ASKED}")
     # a graph of a single launch would take less of the host, but longer on the device
     if device >= 0 and plan.keep is None and len(laid) > 1 and all(step.kind in (_CUDA, _CUDA_BESIDE, _CLEAR) for step in laid):
-        held.append(recorder := _make_recorder(device, plan.asked is not None))
+        held.append(recorder := _make_recorder(device))
+        if recorder is not None and plan.decide is not None:
+            held.append(step := lay(plan.steps[0]._replace(kernel=plan.decide)))
+            recorder.decide = ctypes.addressof(step)
+            recorder.condition = next(field.place for field in plan.decide.fields if field.name == "condition")
         found.recorder = recorder and ctypes.addressof(recorder)
     if any(step.kind == _CUDA_BESIDE for step in laid):
         found.side, found.begun, found.ended = _second_stream(device)
@@ -353,13 +361,11 @@ def _second_stream(device: int) -> tuple[int, int, int]:
     return _driver.make_stream(found), _driver.make_event(found), _driver.make_event(found)
 
 
-def _make_recorder(device: int, asked: bool) -> _Recorder | None:
-    """Return what records launches on a CUDA device, if `asked` behind a condition; None where its driver cannot."""
-    found = _driver.find_device(device)
-    decide = _driver.find_decider(found) if asked else None
-    if not _driver.has_graphs() or (asked and decide is None):
+def _make_recorder(device: int) -> _Recorder | None:
+    """Return what records launches on a CUDA device; None where its driver cannot."""
+    if not _driver.has_graphs():
         return None
-    return _Recorder(stream=_recording_stream(device), context=found.context, decide=decide)
+    return _Recorder(stream=_recording_stream(device), context=_driver.find_device(device).context)
 
 
 @functools.cache

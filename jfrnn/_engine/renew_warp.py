@@ -221,4 +221,6 @@ def _plan(variant: Kind, few: bool, ordered: bool, shapes: Shapes, multiprocesso
     steps = [check, prepare, Launch(around.settle, renew.BLOCK), *rest, keep]
     numbers = {**search.numbers, "blocks": blocks}
     lacking = [*["order"] * (not ordered), *["cutoffs", "vectors", "origin", *_KEPT_OF_BOX] * (not boxed)]
-    return search._replace(steps=steps, numbers=numbers, absent=[*search.absent, *lacking], asked="stale", same=same)
+    return search._replace(
+        steps=steps, numbers=numbers, absent=[*search.absent, "condition", *lacking], asked="stale", decide=around.decide, same=same
+    )

@@ -178,7 +178,7 @@ class Native:
             patch.setattr(plans, "compiler", lambda: self)
             patch.setattr(plans, "_second_stream", lambda device: (7, 71, 72))
             patch.setattr(plans, "_end_of_turn", lambda device: 80 + device)
-            patch.setattr(plans, "_make_recorder", lambda device, asked: plans._Recorder(stream=5, context=6))
+            patch.setattr(plans, "_make_recorder", lambda device: plans._Recorder(stream=5, context=6))
             self.laid[name, device] = plans.lay_plan(name, plan, ["x", "y"], device)
         self.desk.keep(self.laid[name, device])
 

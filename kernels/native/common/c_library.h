@@ -1,7 +1,9 @@
 // What programs take of the C library. Compilers for CUDA know its functions by themselves.
 #pragma once
 
-#if !defined(__CUDACC__)
+#if defined(__CUDACC__)
+extern "C" __device__ void cudaGraphSetConditional(unsigned long long condition, unsigned int value);  // the driver links it
+#else
 extern "C" {
 void* memcpy(void*, const void*, __SIZE_TYPE__);
 void* memset(void*, int, __SIZE_TYPE__);

@@ -65,6 +65,7 @@ constexpr bool BOXES = false;     // each system has a lattice of its own
 // where the order of sources stands in a scratch.
 constexpr int BIT_NOT_FINITE = 2, BIT_OUT_OF_RANGE = 8, BIT_BOX_TOO_SMALL = 4;
 constexpr int FAR = 192, FAR_STEP = 256, FAR_MOST = 1 << 11, LARGEST_TURN = 511, MET_NOT_FINITE = 1 << 10, MET_TOO_FAR = 2 << 10;
+constexpr bool CONDITIONAL = false;  // a kernel sets the condition of a graph
 constexpr int FIRST_PLACE = 2368, PLACE_WORDS = 4, PLACE_WORD = 3;
 // Triangles (see jfrnn/kernels/triangles.py and triangles_cuda.py).
 constexpr int LIMBS = 14, ROOM = 1202, STRIDE = 1;

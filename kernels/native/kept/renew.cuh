@@ -16,6 +16,7 @@ struct RenewArguments {
     int *status, *required, *rebuild_count, *order;  // kept: [1], and [n]
     real *positions, *cutoff;                        // scratch: [n, ROW] and [LATTICE_END], what the search is given
     int *stale, *parts;                              // scratch: [blocks] and [blocks, 2]
+    const int* condition;                            // no address: of a graph that goes on if it is set (CONDITIONAL)
     int n, blocks;
 };
 
@@ -33,8 +34,12 @@ struct Renew : RenewArguments {
         for (long long i = thread_index(); i < n; i += (long long)blocks * BLOCK)
             found |= motion.has_moved(i);
         found = __syncthreads_or(found);
-        if (threadIdx.x == 0)
-            stale[blockIdx.x] = found;
+        if (threadIdx.x > 0)
+            return;
+        stale[blockIdx.x] = found;
+        if constexpr (CONDITIONAL)
+            if (found)
+                cudaGraphSetConditional((unsigned long long)condition, 1);
     }
     // Writes down what the search is given of points, and which of them follow the one before at most a cutoff away.
     JFRNN_MEMBER void prepare() const {

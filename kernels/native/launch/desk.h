@@ -33,7 +33,8 @@ struct Recorded {
 // What records launches on a device, where its driver has graphs that decide by themselves what runs.
 struct Recorder {
     void *stream, *context;
-    void* decide;  // of what is asked, a function of the driver: lets a graph go on if a word is not 0
+    const Step* decide;  // of what is asked, the first step as one that lets a graph go on,
+    int condition;       // and where among its arguments the condition stands
     Recorded recorded[MOST_RECORDED];
     unsigned int turn;
     int locked, fails;

@@ -148,9 +148,11 @@ struct Work {
         for (int k = 0; k < step.array_count; ++k)
             memcpy(bytes + step.arrays[2 * k], &arrays[step.arrays[2 * k + 1]], sizeof(void*));
     }
-    int launch(const Step& step, void* on) const {
+    int launch(const Step& step, void* on, unsigned long long condition = 0) const {
         alignas(16) unsigned char bytes[MOST_BYTES];
         fill(step, bytes);
+        if (condition)
+            memcpy(bytes + plan.recorder->condition, &condition, sizeof(condition));
         void* arguments[1] = {bytes};
         const unsigned int blocks = (unsigned int)((step.threads + step.block - 1) / step.block);
         return blocks ? desk->launch(step.function, blocks, 1, 1, (unsigned int)step.block, 1, 1, 0, on, arguments, nullptr) : 0;
@@ -281,17 +283,9 @@ struct Work {
         static_assert(sizeof(Condition) == 256, "CUgraphNodeParams");
         node.context = recorder.context;
         int wrong = desk->make_condition(&node.condition, graph, recorder.context, 0, 1);
-        struct {
-            unsigned long long condition;
-            void* words;
-            int count;
-        } given = {node.condition, arrays[plan.asked], plan.asked_words};
-        void *before[4], *conditional = nullptr, *arguments[3] = {&given.condition, &given.words, &given.count};
+        void *before[4], *conditional = nullptr;
         size_t count_before = 4;
-        auto ask = [&] {
-            const int lost = begin(plan.steps[0], recorder.stream);
-            return lost ? lost : desk->launch(recorder.decide, 1, 1, 1, 256, 1, 1, 0, recorder.stream, arguments, nullptr);
-        };
+        auto ask = [&] { return launch(*recorder.decide, recorder.stream, node.condition); };
         wrong = wrong ? wrong : record_into(graph, recorder.stream, ask);
         wrong = wrong ? wrong : desk->nodes_of(graph, before, &count_before);
         wrong = wrong ? wrong : desk->add_node(&conditional, graph, before, count_before, &node);

@@ -28,6 +28,7 @@ static bool __syncthreads_or(bool x) { return x; }
 static void atomicOr(int* to, int x) { *to |= x; }
 static void atomicAdd(int* to, int x) { *to += x; }
 static void atomicMax(int* to, int x) { *to = x > *to ? x : *to; }
+static void cudaGraphSetConditional(unsigned long long condition, unsigned int x) { *(int*)condition = (int)x; }
 static int __clz(int x) { return x ? __builtin_clz((unsigned int)x) : 32; }
 template <class To, class From> static To same_bits(From x) { To y; memcpy(&y, &x, sizeof y); return y; }
 static unsigned int __float_as_uint(float x) { return same_bits<unsigned int>(x); }
@@ -59,7 +60,7 @@ class OneThread:
             "kept_vectors": vectors.copy(), "kept_origin": origin.copy(), "status": np.zeros(1, np.int32),
             "required": np.array([3], np.int32), "rebuild_count": np.zeros(1, np.int32), "order": np.zeros(n, np.int32),
             "positions": np.zeros((n, dim + 1), dtype), "cutoff": np.full(30, CUTOFF + SKIN, dtype), "stale": np.zeros(1, np.int32),
-            "parts": np.zeros((1, 2), np.int32),
+            "parts": np.zeros((1, 2), np.int32), "condition": np.zeros(1, np.int32),
         }  # fmt: skip
 
     @staticmethod
@@ -77,7 +78,11 @@ class OneThread:
 
     def is_stale(self, now, before):
         self.arrays |= {"now": np.ascontiguousarray(now[None]), "reference": np.ascontiguousarray(before[None])}
+        self.arrays["condition"][0] = 0
         self.run("check")
+        assert not self.arrays["condition"][0]
+        self.run("decide")
+        assert self.arrays["condition"][0] == self.arrays["stale"][0]
         return bool(self.arrays["stale"][0])
 
 
@@ -152,8 +157,10 @@ def test_a_search_is_given_what_another_one_is(dim, dtype, boxed, spread):
 @pytest.mark.parametrize(("dim", "dtype", "boxed"), KINDS)
 def test_kernels_compile_for_a_gpu(dim, dtype, boxed):
     for ordered in (False, True):
-        check = renew.renew_kernels(dim, dtype is np.float64, boxed, ordered, constants_of(dtype is np.float64)).check
-        assert ".entry Renew_keep(" in _compile.find_binary(check.program, arch=90).read_text()
+        found = renew.renew_kernels(dim, dtype is np.float64, boxed, ordered, constants_of(dtype is np.float64))
+        assert ".entry Renew_keep(" in _compile.find_binary(found.check.program, arch=90).read_text()
+        linked = _compile.find_binary(found.decide.program, arch=90).read_text()
+        assert ".version 8.3\n" in linked and "call.uni \n\tcudaGraphSetConditional" in linked and "keep" not in linked
 
 
 @pytest.mark.skipif(jax.default_backend() != "gpu", reason="only on CUDA lists renew themselves")
