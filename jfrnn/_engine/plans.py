@@ -74,7 +74,7 @@ class Plan(NamedTuple):
         absent: Arrays that no kernel touches, though it names them.
         keep: The number of a CUDA device, or -1 -> what is kept there for all calls, which take turns then.
         asked: The name of an array of int32, on CUDA: the first step writes it, and others are launched if a word is not 0.
-        decide: With `asked`, the kernel of the first step as one that sets its argument `condition`, that of a graph.
+        decide: With `asked`, the first step as one that sets its argument `condition`, that of a graph.
         same: The names of arguments that are other arrays of the call, by the names of these.
     """
 
@@ -83,7 +83,7 @@ class Plan(NamedTuple):
     absent: Sequence[str] = ()
     keep: Callable[[int], Kept] | None = None
     asked: str | None = None
-    decide: Kernel | None = None
+    decide: Launch | None = None
     same: Mapping[str, str] = {}
 
 
@@ -100,8 +100,8 @@ def ask_for_huge_pages(array: str, size: int) -> list[HugePages]:
 def begin_programs(plan: Plan, device: int) -> list[Future[Path]]:
     """Let threads compile what a plan launches on a device, and no file keeps; return what waits for them."""
     # what is launched last takes longest to compile
-    kernels = [step.kernel for step in reversed(plan.steps) if isinstance(step, Launch)] + [plan.decide] * (plan.decide is not None)
-    programs = dict.fromkeys(kernel.program for kernel in kernels)
+    steps = [*reversed(plan.steps), *([] if plan.decide is None else [plan.decide])]
+    programs = dict.fromkeys(step.kernel.program for step in steps if isinstance(step, Launch))
     begun = [compiler().begin(program, _place(program, device)) for program in programs]
     return [job for job in begun if job is not None]
 
@@ -246,9 +246,9 @@ def lay_plan(name: str, plan: Plan, shapes: Mapping[str, tuple[int, ...]], devic
     if device >= 0 and plan.keep is None and len(laid) > 1 and all(step.kind in (_CUDA, _CUDA_BESIDE, _CLEAR) for step in laid):
         held.append(recorder := _make_recorder(device))
         if recorder is not None and plan.decide is not None:
-            held.append(step := lay(plan.steps[0]._replace(kernel=plan.decide)))
+            held.append(step := lay(plan.decide))
             recorder.decide = ctypes.addressof(step)
-            recorder.condition = next(field.place for field in plan.decide.fields if field.name == "condition")
+            recorder.condition = next(field.place for field in plan.decide.kernel.fields if field.name == "condition")
         found.recorder = recorder and ctypes.addressof(recorder)
     if any(step.kind == _CUDA_BESIDE for step in laid):
         found.side, found.begun, found.ended = _second_stream(device)

@@ -215,12 +215,13 @@ def _plan(variant: Kind, few: bool, ordered: bool, shapes: Shapes, multiprocesso
     search = (plan_few if few else plan_on_cuda)(variant, dict(shapes) | {"positions": (n,), "queries": (n,)}, multiprocessors)
     around = renew.renew_kernels(variant.dim, variant.double, boxed, ordered, constants_of(variant.double))
     blocks = renew.blocks(n)
-    check, prepare, keep = (Launch(each, blocks * renew.BLOCK) for each in (around.check, around.prepare, around.keep))
+    threads = blocks * renew.BLOCK
+    check, prepare, keep, decide = (Launch(each, threads) for each in (around.check, around.prepare, around.keep, around.decide))
     cleared = [Clear(name, 4) for name in ("longest", "bits")]  # by what settles
     rest = [step for step in search.steps if step not in cleared]
     steps = [check, prepare, Launch(around.settle, renew.BLOCK), *rest, keep]
     numbers = {**search.numbers, "blocks": blocks}
     lacking = [*["order"] * (not ordered), *["cutoffs", "vectors", "origin", *_KEPT_OF_BOX] * (not boxed)]
     return search._replace(
-        steps=steps, numbers=numbers, absent=[*search.absent, "condition", *lacking], asked="stale", decide=around.decide, same=same
+        steps=steps, numbers=numbers, absent=[*search.absent, "condition", *lacking], asked="stale", decide=decide, same=same
     )
