@@ -28,8 +28,12 @@ static void note(long long kind, long long a, long long b, long long c) {
 static int launch(void* f, unsigned x, unsigned, unsigned, unsigned block, unsigned, unsigned, unsigned, void* stream, void** given,
                   void**) {
     note(1, (long long)stream, *(long long*)given[0], 1000000 * ((int*)given[0])[2] + 1000 * x + block);
-    return ((int*)given[0])[2] == 13 ? 700 : 0;
+    const int number = ((int*)given[0])[2];
+    if (number == 21) note(10, ((long long*)given[0])[2], 0, 0);
+    return number == 13 ? 700 : 0;
 }
+static int read(void* host, unsigned long long address, size_t bytes, void*) { memcpy(host, (void*)address, bytes); return 0; }
+static int finish(void*) { return 0; }
 static int clear(unsigned long long address, unsigned, size_t words, void* stream) {
     note(2, (long long)stream, (long long)address, (long long)words);
     return 0;
@@ -45,6 +49,17 @@ static int begin_record(void* stream, void* graph, const void*, const void*, siz
 static int end_record(void* stream, void**) { note(7, (long long)stream, 0, 0); return 0; }
 static int make_ready(void** ready, void* graph, unsigned long long) { *ready = graph; return graphs > most_graphs; }
 static int drop_graph(void*) { return 0; }
+static int make_condition(unsigned long long* condition, void*, void*, unsigned value, unsigned flags) {
+    *condition = 700 + 10 * value + flags;
+    return 0;
+}
+static int nodes_of(void*, void** nodes, size_t* count) { nodes[0] = (void*)31, *count = 1; return 0; }
+static int add_node(void**, void*, void** before, size_t count, void* node) {  // a conditional one: its condition, and its body
+    static void* body = (void*)40;
+    note(11, (long long)before[0], (long long)count, ((long long*)node)[2]);
+    ((void***)node)[4] = &body;
+    return 0;
+}
 static int run_graph(void* ready, void* stream) { note(8, (long long)stream, (long long)ready, 0); return 0; }
 static int drop_ready(void* ready) { note(9, (long long)ready, 0, 0); return 0; }
 
@@ -78,7 +93,8 @@ void take_turn() { desk->take_lock(desk->turn, 1); }
 void add_one(const void* given) { __atomic_fetch_add(*(int* const*)given, ((const int*)given)[2], __ATOMIC_RELAXED); }
 void* driver(int k) {
     void* all[] = {(void*)launch, (void*)clear, (void*)record, (void*)wait, (void*)make_graph, (void*)drop_graph,
-                   (void*)begin_record, (void*)end_record, (void*)make_ready, (void*)drop_ready, (void*)run_graph};
+                   (void*)begin_record, (void*)end_record, (void*)make_ready, (void*)drop_ready, (void*)run_graph,
+                   (void*)read, (void*)finish, (void*)make_condition, (void*)nodes_of, (void*)add_node};
     return all[k];
 }
 void have_graphs(int most) { graphs = 0, most_graphs = most; }
@@ -126,8 +142,9 @@ const char* call(const char* kernel, int size, int device, int cuda, void* input
 }
 """
 EXECUTE, INSTANTIATE = 3, 0
-LAUNCH, CLEAR, RECORD, WAIT, WORK, BEGIN, END, RUN, DROP = range(1, 10)
+LAUNCH, CLEAR, RECORD, WAIT, WORK, BEGIN, END, RUN, DROP, TOLD, NODE = range(1, 12)
 GRAPHS = "make_graph", "drop_graph", "begin_record", "end_record", "make_ready", "drop_ready", "run_graph"
+GRAPHS += "read", "finish", "make_condition", "nodes_of", "add_node"
 _TEXT = ctypes.c_void_p, ctypes.c_longlong
 _MAKE_PLAN = ctypes.CFUNCTYPE(None, *_TEXT, *_TEXT, ctypes.c_int, ctypes.c_void_p)
 
@@ -179,7 +196,7 @@ class Native:
             patch.setattr(plans, "_second_stream", lambda device: (7, 71, 72))
             patch.setattr(plans, "_end_of_turn", lambda device: 80 + device)
             patch.setattr(plans, "_make_recorder", lambda device: plans._Recorder(stream=5, context=6))
-            self.laid[name, device] = plans.lay_plan(name, plan, ["x", "y"], device)
+            self.laid[name, device] = plans.lay_plan(name, plan, {"x": (1,), "y": (1,)}, device)
         self.desk.keep(self.laid[name, device])
 
     def load(self, program, device):
@@ -260,6 +277,27 @@ def test_launches_of_a_loop_are_recorded_once(native):
         call(3031)
     native.desk.drop(native.laid.pop(("loop@", 0)))
     assert native.events() == [(DROP, 2, 0, 0)]
+
+
+def test_what_is_asked_for_is_launched_by_the_host_once_and_then_by_the_device(native):
+    """A step that sets a condition is recorded in place of the first one, and the others behind that condition."""
+    fields = Field("x", 0, True), Field("number", 8, False), Field("condition", 16, True)
+    decide = Launch(Kernel(native, "add_one", fields, 24, 32), numbers={"number": 21})
+    steps = [native.step(1), native.step(2, numbers={"number": 2})]
+    native.keep("asked@", 0, Plan(steps, {"number": 1}, ["condition"], asked="y", decide=decide))
+    word = np.zeros(1, np.int32)
+    check, rest = (lambda stream, x: launched(stream, x, 1, 1)), (lambda stream, x: launched(stream, x, 2, 1))
+
+    def call(x):
+        assert native.call("asked@", x, word.ctypes.data) is None
+        return native.events()
+
+    assert call(1000) == [check(99, 1000)]
+    graph = [(BEGIN, 5, 1, 0), launched(5, 1000, 21, 1), (TOLD, 701, 0, 0), (END, 5, 0, 0), (NODE, 31, 1, 701)]
+    assert call(1000) == [*graph, (BEGIN, 5, 40, 0), rest(5, 1000), (END, 5, 0, 0), (RUN, 99, 1, 0)]
+    word[0] = 1
+    assert call(1000) == [(RUN, 99, 1, 0)]
+    assert call(2000) == [check(99, 2000), rest(99, 2000)]
 
 
 def test_where_a_driver_cannot_record_all_is_launched(native):
