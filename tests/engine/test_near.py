@@ -1,5 +1,6 @@
 """Particles in a box that kernels bring near it: rows, turns and what is met are those of array programs, bit by bit."""
 
+import functools
 from itertools import product
 
 import jax
@@ -19,15 +20,16 @@ LENGTHS = (10.0, 7.3, 1.7)
 BOUNDS = [22, 23, 24, 28, 29]  # reach, slack and turns, which XLA may count of other vectors than those of its rows
 
 
+@functools.partial(jax.jit, static_argnums=(0, 2))
+def pack(prepare, inputs, options):
+    search = prepare(inputs, options)
+    return *pack_particles(search), search.torus[1].met
+
+
 def prepared(prepare, x, queries, box):
     """Return rows of sources and of queries, numbers of the lattice, and bits of what is met."""
     problem, inputs = check_problem(Asked(x, 0.8, queries=queries, box=box, backend="warp"))
-
-    def pack(inputs):
-        search = prepare(inputs, problem.options)
-        return *pack_particles(search), search.torus[1].met
-
-    return [np.asarray(found) for found in jax.jit(pack)(inputs)]
+    return [np.asarray(found) for found in pack(prepare, inputs, problem.options)]
 
 
 def scene(dim, dtype, spread):
