@@ -91,8 +91,8 @@ def test_constants_stay_in_the_range_of_floats(name):
     x = jnp.asarray([[0, 0, 0], [0.25, 0, 0.5]], jnp.float32)
     constants = [scalars.value(k) for k in scalars.dependencies(better.values()) if scalars.value(k) is not None]
     assert all(value == 0 or LEAST <= abs(float(value)) <= LARGEST for value in constants), constants
-    found, expected = (jfrnn.pair_sum(lambda r, i, j: function(r), x, 1.0, backend=backend) for backend in ("warp", "jax"))
-    np.testing.assert_allclose(found, expected, rtol=1e-6)
+    found = jfrnn.pair_sum(lambda r, i, j: function(r), x, 1.0, backend="warp")
+    np.testing.assert_allclose(found, jax.vmap(function)(x[::-1] - x), rtol=1e-6)
 
 
 @pytest.mark.parametrize("factor", [1, 3])
