@@ -24,13 +24,28 @@ LOOPS = ELSEWHERE._replace(at_once=0)  # as blocks of many queries are processed
 TIES = ("ulp_far_axis", "queries_fewer")
 
 
+@pytest.fixture(scope="module")
+def numbers():
+    """Hold the numbers that programs are compiled with: what was compiled with others is dropped, once for tests in a row."""
+    holder = [tuning.CPU]
+    yield holder
+    if holder != [tuning.CPU]:
+        jax.clear_caches()
+
+
+@pytest.fixture(autouse=True)
+def _compiled_with(request, numbers, monkeypatch):
+    """Compile for the CPU, with the numbers of accelerators where a test asks for them. Two such tests share no shapes."""
+    asked = ELSEWHERE if "elsewhere" in request.fixturenames else tuning.CPU
+    if numbers != [asked]:
+        jax.clear_caches()
+    numbers[:] = [asked]
+    monkeypatch.setattr(tuning, "CPU", asked)
+
+
 @pytest.fixture
-def elsewhere(monkeypatch):
-    """Compile for the CPU with the numbers of accelerators."""
-    jax.clear_caches()
-    monkeypatch.setattr(tuning, "CPU", ELSEWHERE)
-    yield
-    jax.clear_caches()
+def elsewhere():
+    """Ask for the numbers of accelerators."""
 
 
 NUMBERS = {"elsewhere": ELSEWHERE, "all rows of a block at once": AT_ONCE, "blocks in loops": LOOPS}
@@ -38,9 +53,10 @@ EACH = [("elsewhere", name) for name in HARD_CASES if name != "denormal_lattice"
 EACH += [(numbers, name) for numbers in NUMBERS if numbers != "elsewhere" for name in TIES]
 
 
-@pytest.mark.parametrize(("numbers", "name"), slowly(*EACH))
-def test_numbers_of_accelerators_find_the_same_pairs(numbers, name, elsewhere, monkeypatch):
-    monkeypatch.setattr(tuning, "CPU", NUMBERS[numbers])
+@pytest.mark.parametrize(("which", "name"), slowly(*EACH))
+def test_numbers_of_accelerators_find_the_same_pairs(which, name, elsewhere, monkeypatch):
+    jax.clear_caches()  # cases share shapes
+    monkeypatch.setattr(tuning, "CPU", NUMBERS[which])
     given = HARD_CASES[name].build(np.float32, 3)
     nbrs = checked.search_padded(given, max(704, len(given.positions)), 704, backend="jax")
     checked.assert_pairs(nbrs, reference.reference_pairs(given.positions, given.cutoff, queries=given.queries))
@@ -77,15 +93,6 @@ def test_options_with_the_numbers_of_accelerators(kind):
 def test_counts_with_the_numbers_of_accelerators():
     near = by_numpy.image_counts(SOME, 0.2) * (SYSTEMS[:, None] == SYSTEMS)
     np.testing.assert_array_equal(jfrnn.count(SOME, 0.2, batch=SYSTEMS, backend="jax"), near.sum(1))
-
-
-def test_few_particles_are_not_sorted(monkeypatch):
-    monkeypatch.setattr(tuning, "CPU", tuning.CPU._replace(plain_pairs=1 << 20))
-    x = np.round(np.random.default_rng(3).random((600, 3)).astype(np.float32) * 16) / 16  # with ties
-    nbrs = jax.jit(lambda x: jfrnn.search(x, 0.25, capacity=100, backend="jax", half=True))(x)
-    idx = np.asarray(nbrs.idx)
-    assert ((idx[:, 1:] > idx[:, :-1]) | (idx[:, 1:] == 600)).all()  # all pairs are tested in the order of indices
-    checked.assert_pairs(nbrs, reference.reference_pairs(x, 0.25, half=True))
 
 
 def lattice_of(side, dim):
@@ -160,6 +167,15 @@ def everything(x):
     nbrs = jfrnn.search(x, 0.2, capacity=64, box=jfrnn.Box([1.0] * 3), backend="jax")
     sums = jax.value_and_grad(lambda x: jfrnn.pair_sum(spring, x, 0.2, backend="jax").sum())(x)
     return nbrs.idx, nbrs.count, *sums
+
+
+def test_few_particles_are_not_sorted(monkeypatch):
+    monkeypatch.setattr(tuning, "CPU", tuning.CPU._replace(plain_pairs=1 << 20))
+    x = np.round(np.random.default_rng(3).random((600, 3)).astype(np.float32) * 16) / 16  # with ties
+    nbrs = jax.jit(lambda x: jfrnn.search(x, 0.25, capacity=100, backend="jax", half=True))(x)
+    idx = np.asarray(nbrs.idx)
+    assert ((idx[:, 1:] > idx[:, :-1]) | (idx[:, 1:] == 600)).all()  # all pairs are tested in the order of indices
+    checked.assert_pairs(nbrs, reference.reference_pairs(x, 0.25, half=True))
 
 
 def test_more_particles_than_places_are_refused():
