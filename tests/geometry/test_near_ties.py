@@ -153,10 +153,12 @@ OFTEN = [  # each rule, part, space, engine and width; what takes long to compil
     ("scatter", "open", "jax", F32, ("search",)),
     ("either", "open", "jax", F64, ("pair_sum",)),
 ]
+ALIKE = OFTEN[-2:-1]  # of arrays, a count and a sum ask the same
 
 
 @pytest.mark.parametrize(
-    ("rule", "space", "backend", "dtype", "parts"), OFTEN, ids=["-".join([*x[:3], x[3].__name__, *x[4]]) for x in OFTEN]
+    ("rule", "space", "backend", "dtype", "parts"),
+    [pytest.param(*x, id="-".join([*x[:3], x[3].__name__, *x[4]]), marks=[pytest.mark.slow] * (x in ALIKE)) for x in OFTEN],
 )
 def test_some_of_it(rule, space, backend, dtype, parts):
     assert_right(space, rule, backend, dtype, parts)

@@ -20,7 +20,7 @@ def some_cutoffs(rng, number, largest):
     return drawn.astype(np.float32)
 
 
-@pytest.mark.parametrize("rule", [checked.slow(rule) if rule in ("scatter", "both") else rule for rule in RULES])
+@pytest.mark.parametrize("rule", [checked.slow(rule) if rule in ("gather", "scatter", "both") else rule for rule in RULES])
 def test_each_pair_belongs_to_one_part(rule):
     rng = np.random.default_rng(5)
     sources, queries = some_cutoffs(rng, NUMBER, 3.0), some_cutoffs(rng, QUERIES, 2.0)

@@ -4,11 +4,13 @@ So far a machine without a GPU can tell what they answer. Warps of several rows,
 """
 
 import re
+from itertools import product
 
 import jax
 import kept_scenes
 import numpy as np
 import pytest
+from checked import slow, sparing
 
 from jfrnn.kernels import Program, kept
 
@@ -68,21 +70,23 @@ def alone(monkeypatch):
     return asked
 
 
+APART = [(1, np.float32), (5, np.float64), (700, np.float32)]
+
+
 # other numbers of points than elsewhere: what was planned before stays
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("dtype", [np.float32, slow(np.float64)])
 def test_ties_beside_pairs_that_a_wide_box_leaves_in_doubt(alone, dtype):
     kept_scenes.ties_in_a_wide_box(dtype, n=13)
     assert set(alone) == {"sum_kernel", "mask_kernel"}
 
 
-@pytest.mark.parametrize("most", [1, 5, 700])
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize(("most", "dtype"), sparing(product((1, 5, 700), (np.float32, np.float64)), APART))
 def test_pairs_whose_points_lie_boxes_apart(alone, dtype, most):
     kept_scenes.boxes_apart(dtype, most, n=301 + min(most, 9))
     assert set(alone) == {"sum_kernel", "mask_kernel"}
 
 
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("dtype", [slow(np.float32), np.float64])
 def test_in_a_box_as_narrow_as_it_may_be(alone, dtype):
     kept_scenes.narrow_box(2.06, dtype, n=5)
     assert set(alone) == {"sum_kernel", "mask_kernel"}
