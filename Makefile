@@ -65,7 +65,7 @@ docs: $(STAMP)
 test: $(STAMP)
 	$(PY) -m pytest --ignore tests/release
 
-# What a release needs besides. Types are checked by a test, beside the others: pyright takes a minute on one core.
+# What a release needs besides. Types of the library are checked by a test, beside the others; `make lint` checks those of experiments, too.
 check: style
 	$(PY) -m pytest tests/release
 

@@ -6,14 +6,16 @@ import sys
 from pathlib import Path
 
 import pytest
+from checked import slow
 from places import ROOT
 from started import run_python
 
 
-def test_pyright_finds_no_error():
+@pytest.mark.parametrize("paths", [("jfrnn", "tests/release/package/typed.py"), slow(("experiments",))], ids=lambda each: each[0])
+def test_pyright_finds_no_error(paths):
     """A worker that waits for pyright leaves the others all cores but one."""
     room = "--max-semi-space-size=128"  # MB: with less, garbage is collected all the time
-    run_python("-m", "pyright", "--pythonpath", sys.executable, NODE_OPTIONS=room)
+    run_python("-m", "pyright", "--pythonpath", sys.executable, *paths, NODE_OPTIONS=room)
 
 
 @pytest.mark.slow
