@@ -1,6 +1,5 @@
 """Shared by all tests: both float widths are on, and arrays never mix dtypes in silence."""
 
-import gc
 import os
 from itertools import count
 from pathlib import Path
@@ -32,8 +31,7 @@ KEPT = {
 for name, value in KEPT.items():
     jax.config.update(name, value)
     os.environ[name.upper()] = str(value)
-gc.freeze()  # imported modules are no garbage; tracing makes many objects that stay: to look through them takes a tenth of the time
-gc.set_threshold(50_000, 20, 20)
+soon.collect_seldom()
 TESTS = count(1)
 programs._MOST_BYTES = 1 << 40  # tests share programs that come once or twice each
 tuning.CPU = tuning.CPU._replace(plain_pairs=tuning.CPU.few_pairs)  # "jax" sorts most scenes of tests; "brute" tests all pairs
