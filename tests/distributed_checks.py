@@ -83,13 +83,13 @@ def pairs_on(*numbers):
 
 
 @check
-def pairs_on_1_and_8_devices():
-    pairs_on(1, 8)
+def pairs_on_8_devices():
+    pairs_on(8)
 
 
 @check
-def pairs_on_2_and_4_devices():
-    pairs_on(2, 4)
+def pairs_on_1_and_2_and_4_devices():
+    pairs_on(1, 2, 4)
 
 
 @check
@@ -233,7 +233,7 @@ def one_function_in_two_boxes_on_two_meshes():
         box = jfrnn.Box([4.0, 4.0], periodic=periodic)
         particles = distributed.scatter(x, 0.8, x[:, 0], mesh=mesh_of(*shape), box=box)
         found = distributed.pair_sum(pulled, particles, 0.8, particles.values, backend="warp")
-        alone = jfrnn.pair_sum(pulled, jnp.asarray(x), 0.8, jnp.asarray(x[:, 0]), box=box, backend="jax")
+        alone = jfrnn.pair_sum(pulled, jnp.asarray(x), 0.8, jnp.asarray(x[:, 0]), box=box, backend="warp")
         np.testing.assert_allclose(by_id(found, particles), alone, rtol=1e-5)
 
 
@@ -308,6 +308,7 @@ def sums_and_their_gradients(listed=False):
 
     h = jnp.asarray(0.3)
     value, expected = jax.jit(jax.value_and_grad(on_one, (0, 1, 2)))(jnp.asarray(x), jnp.asarray(m), h)
+    slopes = []
     for given in ({"halo": halo}, {"neighbors": nbrs})[: 2 if listed else 1]:
         many = jax.jit(jax.value_and_grad(functools.partial(on_many, **given), (0, 1, 2)))
         ours, (by_x, by_m, by_h) = many(particles.positions, particles.values["m"], h)
@@ -315,10 +316,10 @@ def sums_and_their_gradients(listed=False):
         np.testing.assert_allclose(by_id(by_x, particles), expected[0], rtol=1e-10, atol=1e-9)
         np.testing.assert_allclose(by_id(by_m, particles), expected[1], rtol=1e-10, atol=1e-9)
         np.testing.assert_allclose(by_h, expected[2], rtol=1e-10)
+        slopes.append(by_x)
     step, towards = 1e-6, jnp.asarray(rng.normal(0, 1, particles.positions.shape))
     ends = [on_many(particles.positions + s * towards, particles.values["m"], h, halo=halo) for s in (step, -step)]
-    by_x = jax.grad(functools.partial(on_many, halo=halo))(particles.positions, particles.values["m"], h)
-    np.testing.assert_allclose((ends[0] - ends[1]) / (2 * step), (by_x * towards).sum(), rtol=1e-6)
+    np.testing.assert_allclose((ends[0] - ends[1]) / (2 * step), (slopes[0] * towards).sum(), rtol=1e-6)
 
 
 @check

@@ -15,7 +15,7 @@ CHECKS, SPH, PROCESS = HERE / "distributed_checks.py", HERE / "distributed_sph.p
 QUICK = {  # the others compile longer
     "counts_beside_cuts_that_differ_and_of_strays",
     "one_function_in_two_boxes_on_two_meshes",
-    "pairs_on_1_and_8_devices",
+    "pairs_on_8_devices",
     "particles_move_across_several_shards",
     "particles_that_do_not_fill_a_round_of_migration",
     "sums_and_their_gradients",
