@@ -51,18 +51,29 @@ def lowest_python():
 
 @pytest.fixture(scope="module")
 def python(tmp_path_factory):
-    """Install the lowest versions that are declared, and what tests need besides; return the Python that has them."""
+    """Install the lowest versions that are declared; return the Python that has them."""
     folder, found = tmp_path_factory.mktemp("lowest"), lowest_python()
     assert run(found, "-m", "venv", str(folder / "venv"), cwd=folder).returncode == 0
     pins = folder / "pins.txt"
     pins.write_text("".join(f"{name}=={version}\n" for name, version in VERSIONS.items()))
     python = str(folder / "venv" / "bin" / "python")
-    pip = (python, "-m", "pip", "install", "--quiet", "--no-compile", "--retries", "1", "--timeout", "60")
-    done = run(*pip, "--constraint", str(pins), f"{build_wheel(folder)}[warp]", *TESTING, cwd=folder)
+    install(python, "--constraint", str(pins), f"{build_wheel(folder)}[warp]", cwd=folder)
+    return python
+
+
+@pytest.fixture(scope="module")
+def tested(python, tmp_path_factory):
+    """Install what tests need besides; return the Python."""
+    folder = tmp_path_factory.mktemp("testing")
+    install(python, *(f"{name}=={version}" for name, version in VERSIONS.items()), *TESTING, cwd=folder)
+    return python
+
+
+def install(python, *words, cwd):
+    done = run(python, "-m", "pip", "install", "--quiet", "--no-compile", "--retries", "1", "--timeout", "60", *words, cwd=cwd)
     if done.returncode and (told := re.search(UNREACHABLE, done.stderr)):
         pytest.skip(f"pip reaches no registry ({told[0]}): the lowest versions are not tested")
     assert done.returncode == 0, done.stdout + done.stderr
-    return python
 
 
 def test_what_is_declared_is_installed(python, tmp_path):
@@ -96,14 +107,15 @@ def test_the_command_says_what_runs(python, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kinds", ["f32-3d and (warp or jax)", "not hashgrid"], ids=["single_3d", "all"])
-def test_hard_cases(python, kinds, tmp_path):
+def test_hard_cases(tested, kinds, tmp_path):
     """The hash grid of the lowest Warp is refused. `python -m jfrnn`, which runs each time, has pairs of each engine compared."""
-    done = run(python, *AT_ONCE, str(ROOT / "tests" / "engine" / "test_hard_cases.py"), "-k", kinds, cwd=tmp_path)
+    done = run(tested, *AT_ONCE, str(ROOT / "tests" / "engine" / "test_hard_cases.py"), "-k", kinds, cwd=tmp_path)
     assert done.returncode == 0 and int(re.search(r"(\d+) passed", done.stdout)[1]) > 100, done.stdout + done.stderr
 
 
-def test_sums_are_joined(python, tmp_path):
+@pytest.mark.slow
+def test_sums_are_joined(tested, tmp_path):
     """Pairs are found once for a sum and its gradient, which takes what JAX promises to nobody."""
     which = "energies-open or can_be_read"
-    done = run(python, *AT_ONCE, str(ROOT / "tests" / "sums" / "test_joint.py"), "-k", which, cwd=tmp_path)
+    done = run(tested, *AT_ONCE, str(ROOT / "tests" / "sums" / "test_joint.py"), "-k", which, cwd=tmp_path)
     assert done.returncode == 0 and "2 passed" in done.stdout, done.stdout + done.stderr
