@@ -394,7 +394,7 @@ def test_what_is_done_with_a_list_in_a_box_is_compiled_whole(verb, caplog):
     assert 1 <= caplog.text.count("Finished XLA compilation") <= 6
 
 
-@pytest.mark.parametrize("backend", ["warp", "jax", "brute"])
+@pytest.mark.parametrize("backend", ["warp", slow("jax"), "brute"])
 def test_sums_without_elements(backend):
     x = jnp.array([[0.0, 0], [0.5, 0], [-0.4, 0]])
     found = jfrnn.pair_sum(lambda r, i, j: {"none": jnp.zeros((2, 0), r.dtype), "r": r}, x, 1.0, backend=backend)
@@ -681,7 +681,7 @@ def test_memory_does_not_grow_with_pairs(backend, dim, most, each):
     assert memory.temp_size_in_bytes < most + each * n
 
 
-@pytest.mark.parametrize("backend", ["brute", "warp"])
+@pytest.mark.parametrize("backend", [slow("brute"), "warp"])
 def test_where_a_search_cannot_answer_nothing_looks_like_an_answer(backend):
     """Of array programs, which sum integers, too, and of kernels."""
     x, m = scene(1, dim=3)
@@ -884,7 +884,7 @@ def test_unsigned_integers_are_marked_by_the_largest():
         assert sums.dtype == dtype and sums.tolist() == [1, 1, np.iinfo(dtype).max]
 
 
-@pytest.mark.parametrize("backend", ["warp", "jax"])
+@pytest.mark.parametrize("backend", ["warp", slow("jax")])
 @pytest.mark.parametrize(
     ("cutoff", "box"), [(0.9, jfrnn.Box([1.0, 1.0], images=0)), (np.array([0.5, -1.0, 0.5], np.float32), None)]
 )

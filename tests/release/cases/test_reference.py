@@ -292,7 +292,7 @@ def gram_determinant(matrix, periodic):
     return minor(gram)
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(lattices(), st.sampled_from([0.5, 1.0, 1.25, math.sqrt(2), 1.5]), st.booleans())
 def test_images_equal_the_definition(given, cutoff, closed):
     x, matrix, periodic = given

@@ -96,6 +96,7 @@ def test_a_wrong_list_is_seen():
     assert lists.wrong_rows(scene, (tied, None)) == 3
 
 
+@pytest.mark.slow  # the other benches of lists get their rows in the same way
 @pytest.mark.filterwarnings("ignore")  # of other libraries
 def test_every_library_gets_its_rows(tmp_path, foreign):
     """`bench structures`: those that are there found the same pairs."""

@@ -72,6 +72,7 @@ def test_the_potential_goes_to_zero_smoothly():
     assert np.abs(np.diff(steps)).max() < 5e-4
 
 
+@pytest.mark.slow  # other benches get their rows and tables in the same way; what is timed here, the test of ways compares
 @pytest.mark.filterwarnings("ignore")  # of jax-md
 def test_rows(monkeypatch, tmp_path, foreign):
     monkeypatch.setattr(lj, "SKINS", (0.2, 0.3))

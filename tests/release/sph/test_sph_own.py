@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import pyvista
 import trimesh
-from checked import refuses
+from checked import refuses, slow
 from jax import lax
 from jax.tree_util import Partial
 from places import ROOT
@@ -54,7 +54,7 @@ def test_an_own_force_that_returns_something_else_is_refused(force, got):
     refuses(SceneError, message, sph.begin, sph.make_model(FREE, force=force), sph.make_state(FREE))
 
 
-@pytest.mark.parametrize("integrator", ["symplectic", "midpoint"])
+@pytest.mark.parametrize("integrator", [slow("symplectic"), "midpoint"])
 def test_forces_know_the_time_and_velocities_of_the_positions_they_are_given(integrator):
     """A force of time and velocities, cos 3t - v, is integrated to second order: half the step, a quarter of the error."""
     off = []

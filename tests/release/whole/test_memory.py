@@ -108,8 +108,13 @@ def test_few_particles_take_no_scratch_on_a_gpu():
 @pytest.mark.parametrize(
     ("n", "capacity", "dim", "dtype", "queries"),
     [
-        *((300_000, 256, 2, np.float64, None), (4_000_000, 64, 3, np.float32, None)),
-        *slowly((1000, 40, 3, np.float32, None), (1000, 40, 2, np.float32, 30_000), (20_000, 64, 2, np.float32, None)),
+        (300_000, 256, 2, np.float64, None),
+        *slowly(
+            (4_000_000, 64, 3, np.float32, None),
+            (1000, 40, 3, np.float32, None),
+            (1000, 40, 2, np.float32, 30_000),
+            (20_000, 64, 2, np.float32, None),
+        ),
         *slowly((20_000, 20_000, 2, np.float64, None), (4_000_000, 64, 3, np.float64, None)),
     ],
 )
@@ -232,7 +237,7 @@ print(memory.source, memory.peak() - memory.start)
 """
 
 
-@pytest.mark.parametrize("gradient", [False, True])
+@pytest.mark.parametrize("gradient", [slow(False), True])
 def test_sums_take_what_was_planned(gradient):
     """In a process of its own, as a search above."""
     n, path = 300_000, os.pathsep.join(map(str, (ROOT, TESTS, TESTS / "release" / "whole")))
