@@ -36,10 +36,10 @@ def points(n, dim, dtype, seed=0):
 
 
 @pytest.mark.parametrize(
-    ("box", "dim", "dtype"),
+    ("dim", "dtype", "box"),
     sparing(
-        [(box, *kind) for box, kind in product(BOXES, KINDS)],
-        [(box, *kind) for box in BOXES for kind in (CROSSED if box == "box" else OTHERS)],
+        [(*kind, box) for box, kind in product(BOXES, KINDS)],
+        [(*kind, box) for box in BOXES for kind in (OTHERS if box == "box" else CROSSED)],
     ),
 )
 def test_one_point_that_moves_decides(dim, dtype, box):
