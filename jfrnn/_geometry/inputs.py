@@ -121,12 +121,12 @@ def is_real(given: Given) -> bool:
     return any(jnp.issubdtype(kind, reals) for reals in (np.floating, np.integer))
 
 
-def check_cutoff(cutoff: Given, dtype: np.dtype) -> float:
-    """Return one cutoff for all particles, rounded to the dtype of the positions."""
+def check_cutoff(cutoff: Given, dtype: np.dtype, instead: str = "") -> float:
+    """Return one cutoff for all particles, rounded to the dtype of the positions; `instead`: what else may be traced."""
     if isinstance(cutoff, Tracer):
         raise TypeError(
-            "cutoff must be a static number, got a traced value: pass a Python float, mark the argument with "
-            "jax.jit(..., static_argnames='cutoff'), or pass an array with one per particle, which may be traced."
+            "cutoff must be a static number, got a traced value: pass a Python float, or mark the argument with "
+            f"jax.jit(..., static_argnames='cutoff'){instead}."
         )
     if np.ndim(cutoff) != 0:
         raise ValueError(f"cutoff must be one number, got an array of shape {list(np.shape(cutoff))}.")

@@ -187,7 +187,8 @@ def check_problem(asked: Asked) -> tuple["Problem", engine.Inputs]:
         raise ValueError(f"half=True keeps pairs without direction, which radius_rule={radii.rule!r} gives: pass 'either'.")
     radii = dataclasses.replace(radii, itself=True) if radii is not None and queries is None and not drop_self else radii
     excluded = None if asked.exclude is None else geometry.check_exclusions(asked.exclude, sources, queries)
-    radius = geometry.check_cutoff(asked.cutoff, dtype) if radii is None else None
+    instead = ", or pass an array with one per particle, which may be traced"
+    radius = geometry.check_cutoff(asked.cutoff, dtype, instead) if radii is None else None
     largest = radius if radii is None else geometry.largest_known(radii)
     skin = geometry.check_skin(asked.skin, largest or 0.0, dtype)
     reach = None if largest is None else list_radius(largest, skin, dtype)

@@ -92,7 +92,7 @@ def pairs_of_list(
     sources, rows, box = nbrs._geometry_inputs(positions, queries, box)
     dtype = np.dtype(sources.dtype)
     if cutoff is not None:
-        asked = geometry.check_cutoff(cutoff, dtype)
+        asked = geometry.check_cutoff(cutoff, dtype, ", or make the list with an array of one per particle, which may be traced")
         if nbrs.cutoff is None or asked > nbrs.cutoff:
             has = "a cutoff per particle" if nbrs.cutoff is None else f"cutoff={nbrs.cutoff}"
             raise ValueError(f"cutoff must be None or at most that of the list, which has {has}, got {cutoff!r}.")

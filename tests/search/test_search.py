@@ -287,7 +287,12 @@ def test_input_errors(error, match, arguments):
     ("error", "match", "function"),
     [
         (ValueError, "capacity must be given where positions are traced", lambda x: jfrnn.search(x, 1.0).count),
-        (TypeError, "cutoff must be a static number, got a traced value", lambda x: jfrnn.search(x, x[0, 0], capacity=4).count),
+        (TypeError, "cutoff must be a static .*traced.*or pass an array", lambda x: jfrnn.search(x, x[0, 0], capacity=4).count),
+        (
+            TypeError,
+            "cutoff must be a static .*traced.*or make the list with an array",
+            lambda x: jfrnn.pair_sum(lambda r, i, j: r @ r, x, x[0, 0], neighbors=jfrnn.search(x, 1.0, capacity=4)),
+        ),
         (TypeError, "capacity must be a static int .* got a traced", lambda x: jfrnn.search(x, 1.0, capacity=x.astype(int)[0, 0])),
         (TypeError, "half must be True or False, known while tracing.*traced", lambda x: jfrnn.count(x, 1.0, half=x[0, 0] > 0)),
     ],

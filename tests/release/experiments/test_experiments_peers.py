@@ -46,7 +46,7 @@ def _sleep(given):
     time.sleep(60)
 
 
-@pytest.mark.parametrize(("ask", "said"), [slow(_stop, "crash (3)", id="crash"), slow(_sleep, "none in 2 s", id="endless")])
+@pytest.mark.parametrize(("ask", "said"), [pytest.param(_stop, "crash (3)", id="crash"), slow(_sleep, "none in 2 s", id="endless")])
 def test_a_peer_that_crashes_or_does_not_end_says_so(ask, said, monkeypatch):
     monkeypatch.setattr(peers, "_serve", _serve_with)
     monkeypatch.setattr(peers, "PEERS", {ask.__name__: peers._Peer("jfrnn", ask)})
