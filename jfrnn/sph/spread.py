@@ -67,7 +67,8 @@ class Spread:
         return distributed.pair_sum(fn, particles, particles.reach, values, halo=self.halo, backend=self.backend)
 
     def _at(self, positions: Array, active: Array | None) -> Particles:
-        return self.particles.replace(positions if active is None else jnp.where(active[:, None], positions, jnp.nan))
+        ids = self.particles.ids  # sums are 0 of rows that hold no particle, and so of one that takes no part
+        return replace(self.particles, positions=positions, ids=ids if active is None else jnp.where(active, ids, -1))
 
 
 @jax.tree_util.register_dataclass
