@@ -122,7 +122,8 @@ class Scene:
         sealed: Lower and upper corner [m] of what no particle of the fluid may leave, infinite where there is no wall; None: there
             are none.
         enters: When each particle enters [s], shape [n]; until then it waits and takes no part. None: all are there.
-        guided: How long a particle that entered keeps its velocity [s], whatever acts on it.
+        guided: How long a particle that entered keeps its velocity [s], whatever acts on it: each, those that are there at first as
+            well; or of shape [n].
         outflow: Lower and upper corner [m] of what particles of the fluid leave for good, infinite where they cannot; None: they
             stay.
         densities: Densities at first [kg/m³], shape [n], where they are carried; None: the rest density.
@@ -143,7 +144,7 @@ class Scene:
     bounds: Tank | None = None
     sealed: Tank | None = None
     enters: NDArray[np.float64] | None = None
-    guided: float = 0.0
+    guided: float | NDArray[np.float64] = 0.0
     outflow: Tank | None = None
     densities: NDArray[np.float64] | None = None
     pressures: NDArray[np.float64] | None = None

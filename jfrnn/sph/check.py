@@ -211,7 +211,11 @@ def check_physics(physics: Any) -> None:  # noqa: ANN401
 def _check_fluid(scene: FluidScene) -> None:
     """Refuse physics that does not go with where the particles are."""
     physics = scene.physics
-    if scene.guided != 0:
+    if np.ndim(scene.guided):
+        each = _check_array("guided", scene.guided, (scene.n,), f"[] or [{scene.n}], as positions say")
+        if not (np.isfinite(each) & (each >= 0)).all():
+            raise SceneError(f"guided must be finite numbers from 0, got from {each.min()} to {each.max()}.")
+    elif scene.guided != 0:
         _check_number("guided", scene.guided)
     if physics.gravity is not None and len(physics.gravity) != scene.dim:
         raise SceneError(f"gravity has {len(physics.gravity)} components, expected {scene.dim} in {scene.dim}D")

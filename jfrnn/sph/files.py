@@ -113,7 +113,7 @@ def _replace_particles(scene: Scene, positions: np.ndarray, velocities: np.ndarr
         velocities=np.concatenate([velocities, scene.velocities[walls]]),
         masses=np.concatenate([masses, scene.masses[walls]]),
         wall=None if scene.wall is None else np.arange(len(positions) + walls.sum()) >= len(positions),
-        **{"enters": None, "densities": None, "pressures": None},
+        **{"enters": None, "guided": 0.0, "densities": None, "pressures": None},
     )
 
 

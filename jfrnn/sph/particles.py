@@ -40,7 +40,7 @@ class Model:
         tank: Lower and upper corner [m] of a tank, shape [d] each.
         enters: When each particle enters [s], shape [n].
         step: Time step [s]; None: the Courant condition gives it.
-        guided: How long a particle that entered keeps its velocity [s], shape [].
+        guided: How long a particle that entered keeps its velocity [s], shape [] or [n].
         spacing: Particle distance [m]. Static.
         fluid_count: How many particles stand before those of walls; None where there are no walls, or among the fluid. Static.
         backend: Of `jfrnn.pair_sum`. Static.

@@ -22,7 +22,7 @@ from jfrnn.sph import solver
 from jfrnn.sph.particles import Model, State, active
 
 OF_STATE = ("v", "a", "rho", "p", "w", "gone")  # what of a state is known of each particle, besides positions
-_OF_MODEL = ("m", "wall", "enters")
+_OF_MODEL = ("m", "wall", "enters", "guided")
 _NEVER = np.inf
 
 
@@ -108,13 +108,13 @@ def spread(model: Model, s: State, mesh: Mesh, settle: int = 10, slack: float = 
     """
     if s.solid is not None:
         raise ValueError("s must be a state without a wall of triangles, which sums over devices do not see: run it on one device.")
-    rows = {name: getattr(s, name) for name in OF_STATE} | {name: getattr(model, name) for name in _OF_MODEL}
     if model.enters is None:
-        rows["enters"] = np.full(len(s.x), -_NEVER, s.x.dtype)
-        model = replace(model, guided=jnp.zeros((), s.x.dtype))
+        never: Any = np.full(len(s.x), -_NEVER, s.x.dtype)
+        model = replace(model, enters=never, guided=jnp.zeros((), s.x.dtype))
+    of_model: Any = {name: getattr(model, name) for name in _OF_MODEL if np.ndim(getattr(model, name))}
+    rows = {name: getattr(s, name) for name in OF_STATE} | of_model
     particles = distributed.scatter(s.x, model.cutoff, rows, mesh=mesh, box=model.box, along=along, slack=slack)
-    rest: Any = dict.fromkeys(_OF_MODEL)
-    return Flow(particles, replace(model, fluid_count=None, **rest), s.time, s.last, settle)
+    return Flow(particles, replace(model, fluid_count=None, **dict.fromkeys(of_model)), s.time, s.last, settle)
 
 
 def begin(flow: Flow) -> Flow:
@@ -161,7 +161,7 @@ def advance(flow: Flow, steps: Array | int) -> Flow:
 def _with_solver(advance: Callable[[Model, State, Any], tuple[State, Any]], flow: Flow) -> Flow:
     """Advance by what updates the neighbors that it gets, at the positions whose pairs it wants, before it sums."""
     particles, values = flow.particles, flow.particles.values
-    of_model = {name: values[name] for name in _OF_MODEL}
+    of_model = {name: values[name] for name in _OF_MODEL if name in values}
     of_model["enters"] = jnp.where(particles.active, values["enters"], _NEVER)
     model = replace(flow.model, **of_model)
     s = State(particles.positions, time=flow.time, last=flow.last, **{name: values[name] for name in OF_STATE})

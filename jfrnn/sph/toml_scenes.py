@@ -169,14 +169,16 @@ def _make(given: Own, path: Path) -> FluidScene:
         v = np.zeros(x.shape[1]) if block.velocity is None else np.array(block.velocity)
         if v.shape != x.shape[1:]:
             raise SceneError(f"fill.velocity must have {x.shape[1]} numbers, got {block.velocity}")
-        parts.append((x, np.broadcast_to(v, x.shape), np.zeros(len(x))))
-    parts += [_inflow(way, dx) for way in given.inflow]
+        parts.append((x, np.broadcast_to(v, x.shape), *np.zeros((2, len(x)))))
     layers = int(np.ceil(KERNELS[physics.kernel].support * physics.smoothing / dx * (1 - 1e-12)))
+    for way in given.inflow:
+        x, v, enters = _inflow(way, dx)
+        parts.append((x, v, enters, np.full(len(x), layers * dx / float(np.abs(way.velocity).max()))))
     walls = [_tank(each, dx, layers) for each in given.walls]
-    parts += [(x, np.zeros_like(x), np.zeros(len(x))) for x in walls]
-    if not parts or len({x.shape[1] for x, _, _ in parts}) != 1:
+    parts += [(x, np.zeros_like(x), *np.zeros((2, len(x)))) for x in walls]
+    if not parts or len({x.shape[1] for x, *_ in parts}) != 1:
         raise SceneError("fill, inflow and walls must hold particles, all in 2D or all in 3D")
-    x, v, enters = (np.concatenate(column) for column in zip(*parts, strict=True))
+    x, v, enters, guided = (np.concatenate(column) for column in zip(*parts, strict=True))
     dim, dummies = x.shape[1], sum(map(len, walls))
     scene = FluidScene(
         name=path.stem,
@@ -190,7 +192,7 @@ def _make(given: Own, path: Path) -> FluidScene:
         periodic=given.periodic and _periodic(given.periodic, dim),
         bounds=given.bounds and Tank(tuple(given.bounds.lower), tuple(given.bounds.upper)),
         enters=enters if given.inflow else None,
-        guided=max((layers * dx / float(np.abs(way.velocity).max()) for way in given.inflow), default=0.0),
+        guided=guided if given.inflow else 0.0,
         outflow=given.outflow and Tank(tuple(given.outflow.lower), tuple(given.outflow.upper)),
         physics=physics,
     )

@@ -52,6 +52,8 @@ def turning(center=(0.0, 0.0), rate=1.0):
             r"tank must be infinite along axes that are periodic, \(False, True\), got Tank",
         ),
         ({"guided": -1.0}, "guided must be a finite number above 0, got -1.0"),
+        ({"guided": np.array([1.0, -1.0, 0.0, 0.0, 0.0])}, "guided must be finite numbers from 0, got from -1.0 to 1.0"),
+        ({"guided": np.zeros(3)}, r"guided must be an array of shape \[\] or \[5\], as positions say, real numbers, got an array"),
         ({"sealed": fluids.Tank((1.0, 0.0), (0.0, 1.0))}, "sealed must reach from a lower to an upper corner"),
         ({"periodic": fluids.Periodic((0.0, 0.0), (1.0, 1.0), (True,))}, "periodic.axes must say of each of 2 axes"),
         ({"periodic": fluids.Periodic((0.0, 0.0), (1.0, 1.0, 1.0), (True, True))}, "periodic.lengths must have a number for each"),

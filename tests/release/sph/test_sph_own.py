@@ -479,7 +479,19 @@ def test_layers_that_enter_aslant_are_a_spacing_apart(tmp_path):
     (tmp_path / "bath.toml").write_text(BATH.replace("velocity = [0.0, -1.0]", "velocity = [1.0, -1.0]"))
     scene = sph.read_scene(tmp_path / "bath.toml")
     np.testing.assert_allclose(scene.enters[12:15], [0.0, 0.1, 0.2], atol=1e-12)  # of which each has gone on by 0.1 m along y
-    assert scene.guided == pytest.approx(0.3)
+    np.testing.assert_allclose(scene.guided[12:15], 0.3)
+
+
+def test_what_enters_holds_nothing_but_its_own_velocity(tmp_path):
+    """Water that is there at first falls from the first step on, and each inflow is guided for as long as its own layers take."""
+    slow = BATH.partition("[[inflow]]")[2].replace("0.1", "0.8").replace("[0.0, 0.5]", "[0.7, 0.5]").replace("-1.0", "-0.5")
+    (tmp_path / "bath.toml").write_text(f"{BATH}[[inflow]]{slow}")
+    scene = sph.read_scene(tmp_path / "bath.toml")
+    np.testing.assert_allclose(scene.guided[:16], [0.0] * 12 + [0.3] * 3 + [0.6])
+    model = sph.make_model(scene)
+    end, *_ = sph.advance_until(model, sph.begin(model, sph.make_state(scene)), None, 0.01)
+    assert np.abs(end.v[:12] - scene.velocities[:12]).max(axis=1).min() > 1e-3
+    np.testing.assert_array_equal(end.v[12:16], scene.velocities[12:16])
 
 
 def test_the_file_of_the_page_is_a_scene(tmp_path):
