@@ -110,7 +110,9 @@ def force_on_walls(about: Sequence[float] | None = None) -> Probe:
         if isinstance(model, GasModel):
             raise SceneError("force_on_walls is a probe of fluids, got a gas, which has no walls: leave it out.")
         a = s.a
-        if model.guided is not None:  # particles that keep their velocity have no acceleration, and yet push others: let go of them
+        # particles that keep their velocity have no acceleration, and yet push others: let go of them; other integrators keep
+        # accelerations of other positions, and at first none
+        if model.guided is not None or model.physics.integrator != "symplectic":
             free = replace(model, guided=None, physics=replace(model.physics, integrator="symplectic"))
             a = solver.begin(free, s).a
         a = a if model.physics.gravity is None else a - model.physics.gravity

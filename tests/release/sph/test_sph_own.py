@@ -170,6 +170,9 @@ def test_the_force_on_walls_knows_what_guides_particles_that_enter():
         found.append(np.concatenate(jax.tree.map(np.atleast_1d, list(sph.force_on_walls()(model, s).values()))))
     assert np.abs(found[0]).min() > 0.01
     np.testing.assert_allclose(found[1], found[0], rtol=1e-9)
+    model = sph.make_model(changed(scene, integrator="midpoint"), backend="brute")  # whose states at first have no acceleration
+    force = sph.force_on_walls()(model, sph.begin(model, sph.make_state(scene)))["force"]
+    np.testing.assert_allclose(force, found[0][:2], rtol=1e-9)
 
 
 @pytest.mark.parametrize(
