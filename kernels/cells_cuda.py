@@ -142,6 +142,11 @@ def lanes_of_query(m: int) -> int:
     return min(QUERY_BLOCK >> share_bits(m), 4)
 
 
+def has_parts(m: int, own: bool) -> bool:
+    """Say whether blocks of m queries that are scattered may be served in parts: where they are the sources, and not very many."""
+    return own and share_bits(m) > _PART_BITS and m <= _MOST_PARTED
+
+
 def query_blocks(m: int) -> int:
     """Return how many warps m queries are shared among."""
     return _shares(m, share_bits(m))
@@ -154,11 +159,10 @@ def _shares(m: int, bits: int) -> int:
 def walks(query: Kernel, crossing: Kernel | None, m: int, own: bool, multiprocessors: int) -> list[Launch]:
     """Return the launches that walk over m queries: those whose reach leaves a periodic box have a kernel of their own.
 
-    Where queries are the sources, warps to spare serve parts of blocks that are scattered (`native/walk/walk.cuh`).
+    Where blocks `has_parts`, warps to spare serve parts of those that are scattered (`native/walk/walk.cuh`).
     """
     blocks = query_blocks(m)
-    spare = blocks // 8 if own and share_bits(m) > _PART_BITS and m <= _MOST_PARTED else 0
-    walk = Launch(query, (spare + blocks) * QUERY_BLOCK, False, beside=crossing is not None)
+    walk = Launch(query, (blocks // 8 * has_parts(m, own) + blocks) * QUERY_BLOCK, False, beside=crossing is not None)
     if crossing is None:
         return [walk]
     return [Launch(crossing, min(blocks, _CROSSING * multiprocessors) * QUERY_BLOCK, False), walk]  # first what takes longest
@@ -170,15 +174,16 @@ def walking_blocks(kind: Kind) -> int:
 
 
 @functools.lru_cache(512)
-def cell_kernels(kind: Kind, lanes: int = 1) -> Kernels:
-    """Return the kernels that sort by cell, and that list or count, with so many `lanes_of_query`."""
+def cell_kernels(kind: Kind, lanes: int = 1, parted: bool = False) -> Kernels:
+    """Return the kernels that sort by cell, and that list or count, with so many `lanes_of_query`; `parted`: it `has_parts`."""
     compiled, lanes = kind.compiled(), lanes if kind.lists else 1
-    constants = {"LIST": kind.lists, "SUMS": 0, "QUERY_LANES": lanes, **GRID}
+    constants = {"LIST": kind.lists, "SUMS": 0, "QUERY_LANES": lanes, "PARTED": parted, **GRID}
 
     def query_kernel(name: str, crossing: bool = False) -> Kernel:
         entry = Entry("Rows.run", QUERY_BLOCK, walking_blocks(kind), "Rows_cross" * crossing)
         own = constants | {"CROSSING": crossing}
-        return declare_kind(compiled, f"{name}_cuda_{lanes}l", "rows.cuh", entry, cuda=True, constants=own)[0]
+        called = f"{name}_cuda_{lanes}l{'_parted' * parted}"
+        return declare_kind(compiled, called, "rows.cuh", entry, cuda=True, constants=own)[0]
 
     methods = ("find_bounds", "lay_out_grid", "count_cells", "scan_counts", "scatter_ids", "gather_places")
     stages = [Entry(f"Search.{method}", BLOCK) for method in methods]

@@ -72,8 +72,8 @@ def _placed_columns(term: TermText, dim: int) -> int:
 
 
 @functools.lru_cache(512)
-def sum_kernels(kind: Kind, term: TermText, key: str, lanes: int = 1) -> Kernels:
-    """Return the kernels that sum a term, with so many `lanes_of_query`; `key` tells it from all others in the names of programs.
+def sum_kernels(kind: Kind, term: TermText, key: str, lanes: int = 1, parted: bool = False) -> Kernels:
+    """Return the kernels that sum a term, as `cell_kernels` those that list; `key` tells it from others in names of programs.
 
     For extremes, `errors` [m, width, 2] gets the sources of the largest summands (n: there is none), and the codes of their images,
     as integers travel among floats.
@@ -92,7 +92,8 @@ def sum_kernels(kind: Kind, term: TermText, key: str, lanes: int = 1) -> Kernels
         "FROM_PLACES": from_places,
     }
     constants |= {"ROW_LENGTH": max(length, 1), "PLACED": _placed_columns(term, kind.dim)}
-    constants |= {"QUERY_LANES": lanes, "COLUMNS": len(term.other_columns), "READS_ROWS": term.reads_rows}
+    parted = parted and not kind.tree
+    constants |= {"QUERY_LANES": lanes, "PARTED": parted, "COLUMNS": len(term.other_columns), "READS_ROWS": term.reads_rows}
 
     declare_one = functools.partial(declare_kind, kind.compiled(), cuda=True)
 
@@ -100,7 +101,11 @@ def sum_kernels(kind: Kind, term: TermText, key: str, lanes: int = 1) -> Kernels
         entry = Entry("Sums.run", QUERY_BLOCK, blocks, "Sums_cross" * crossing)
         given = term_header(term, kind.double, by_rows=True)
         return declare_one(
-            f"{name}_{key}_{lanes}l", "pair_sum.cuh", entry, given=given, constants=constants | {"CROSSING": crossing}
+            f"{name}_{key}_{lanes}l{'_parted' * parted}",
+            "pair_sum.cuh",
+            entry,
+            given=given,
+            constants=constants | {"CROSSING": crossing},
         )[0]
 
     sorting = Entry("SortValues.run", QUERY_BLOCK, 32)

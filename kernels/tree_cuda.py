@@ -56,7 +56,7 @@ def walk_threads(queries: int) -> int:
 def query_kernel(kind: Kind, lanes: int = 1) -> Kernel:
     """Return the kernel that lists or counts, with so many `lanes_of_query`."""
     lanes = lanes if kind.lists else 1
-    constants = {**GRID, "CROSSING": kind.periodic > 0, "LIST": kind.lists, "SUMS": 0, "QUERY_LANES": lanes}
+    constants = {**GRID, "CROSSING": kind.periodic > 0, "LIST": kind.lists, "SUMS": 0, "QUERY_LANES": lanes, "PARTED": False}
     entry = Entry("Rows.run", QUERY_BLOCK, walking_blocks(kind), "Rows_of_tree")
     of_tree = kind.compiled()._replace(tree=True)
     return declare_kind(of_tree, f"tree_cuda_{lanes}l", "rows.cuh", entry, cuda=True, constants=constants)[0]

@@ -285,8 +285,9 @@ def _few_callable(kind: Kind) -> Call:
 def plan_on_cuda(kind: Kind, shapes: Shapes, multiprocessors: int) -> Plan:
     """Return what is launched for a search among cells."""
     numbers = plan_numbers(kind, shapes)
-    kernels = cells_cuda.cell_kernels(kind, cells_cuda.lanes_of_query(numbers["m"]))
-    launches = kernels.launches(numbers["n"], numbers["m"], kind.own, multiprocessors)
+    m = numbers["m"]
+    kernels = cells_cuda.cell_kernels(kind, cells_cuda.lanes_of_query(m), cells_cuda.has_parts(m, kind.own))
+    launches = kernels.launches(numbers["n"], m, kind.own, multiprocessors)
     return Plan(place_launches(launches), numbers, absent(kind))
 
 

@@ -101,8 +101,9 @@ def _cpu_callable(kind: Kind, term: TermText, key: str) -> Call:
 def _cuda_callable(kind: Kind, term: TermText, key: str) -> Call:
     def plan(shapes: Shapes, multiprocessors: int) -> Plan:
         numbers = _numbers(kind, term, shapes)
-        kernels = pair_sum_cuda.sum_kernels(kind, term, key, cells_cuda.lanes_of_query(numbers["m"]))
-        launches = kernels.launches(numbers["n"], numbers["m"], kind.own, multiprocessors)
+        m = numbers["m"]
+        kernels = pair_sum_cuda.sum_kernels(kind, term, key, cells_cuda.lanes_of_query(m), cells_cuda.has_parts(m, kind.own))
+        launches = kernels.launches(numbers["n"], m, kind.own, multiprocessors)
         return Plan([Launch(x.kernel, x.threads, beside=x.beside) for x in launches], numbers)
 
     return describe_sums("pair_sum_cuda", kind, key, plan, (*_GIVEN, *_WORDS), more={"values": scalar_of(kind)})

@@ -34,6 +34,7 @@ constexpr int PARTS = 256, PART = 9, LEFT_OUT = 16, TILE = 2048, BLOCK = 256, WA
 constexpr bool LATER = false;     // only those neighbors that come after the query
 constexpr bool CROSSING = false;  // queries whose reach leaves a periodic box
 constexpr int TAKEN = 4;          // pairs that a lane evaluates at once
+constexpr bool PARTED = true;     // blocks that are scattered may be served in parts
 constexpr int QUERY_LANES = 1;    // of a warp that a query has once its pairs are known
 constexpr int PLACED = 3;         // coordinates of j before its numbers, in a row of ROW_LENGTH
 constexpr int ROW_LENGTH = 4;

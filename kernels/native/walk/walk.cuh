@@ -40,6 +40,14 @@ struct Walk : PairSearch {
             serve(block, 0, 32);
             return;
         }
+        if constexpr (!PARTED) {
+            if constexpr (CROSSING)
+                for (int turn = block; turn < shared.crossing; turn += (int)(threads / 32))
+                    serve(crossing[turn], 0, 32);
+            else if (!PERIODIC || !crosses[block])
+                serve(block, 0, 32);
+            return;
+        }
         // Behind whole blocks, each of which has a warp of its own, or a turn where queries cross, come parts of the scattered ones,
         // unless there are many: to spare warps, which begin before the others.
         const int warps = (int)(threads / 32), spare = CROSSING ? warps : warps - query_blocks;

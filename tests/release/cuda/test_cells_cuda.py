@@ -63,7 +63,7 @@ def test_rows_of_particles_in_a_box_compile(skewed):
 
 
 def test_boxes_batches_and_cutoffs_per_particle_compile():
-    assert compiles(*cells_cuda.cell_kernels(Kind(3, False, lists=True, periodic=2, batched=1))) == 3
+    assert compiles(*cells_cuda.cell_kernels(Kind(3, False, lists=True, periodic=2, batched=1), parted=True)) == 3
     for rule, periodic in (("mean", 2), ("gather", 0)):
         kind = Kind(3, False, scaled=True, lists=True, periodic=periodic, rule=rule)
         batched = kind._replace(batched=1)
