@@ -90,16 +90,21 @@ def test_cuda_is_there_for_the_lowest_jax_that_is_declared_with_it(python, tmp_p
     assert lowest(PROJECT["optional-dependencies"]["cuda13"])["jax"] in versions, done.stderr
 
 
+def complaints(done):
+    """Return what a process said, but for what it says on a slow machine: that it compiles."""
+    return [line for line in done.stderr.splitlines() if not line.startswith("jfrnn compiles kernels, ")]
+
+
 def test_the_readme_runs_as_pasted(python, tmp_path):
     page = tmp_path / "README.md"
     shutil.copy(ROOT / "README.md", page)
     done = run(python, "-W", "error::RuntimeWarning", "-c", pasted.PROGRAM, str(page), cwd=tmp_path)
-    assert pasted.lines_run(done.stdout).get(str(page), 0) > 20 and not done.stderr, done.stdout + done.stderr
+    assert pasted.lines_run(done.stdout).get(str(page), 0) > 20 and not complaints(done), done.stdout + done.stderr
 
 
 def test_the_command_says_what_runs(python, tmp_path):
     done = run(python, "-W", "error", "-m", "jfrnn", cwd=tmp_path)
-    assert done.returncode == 0 and not done.stderr, done.stdout + done.stderr
+    assert done.returncode == 0 and not complaints(done), done.stdout + done.stderr
     told = dict(re.findall(r"^  (\w+) +(right|does not run: .*)", done.stdout, re.MULTILINE))
     assert [told[name] for name in ("jax", "warp", "brute")] == ["right"] * 3
     assert told["hashgrid"].startswith("does not run: the HashGrid of warp-lang") or VERSIONS["warp-lang"] != "1.18"
