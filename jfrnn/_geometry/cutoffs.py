@@ -8,7 +8,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
-from jax.core import Tracer
 
 from jfrnn._geometry.floats import two_sum, unit_scale
 from jfrnn._tracing import portable
@@ -89,12 +88,6 @@ class Radii:
     table: Array | None = None
     itself: bool = dataclasses.field(default=False, metadata={"static": True})
     alike: bool = dataclasses.field(default=False, metadata={"static": True})
-
-    def with_table(self, table: Array) -> "Radii":
-        """Return them with these cutoffs of pairs of species."""
-        farthest = None if isinstance(table, Tracer) else np.asarray(jax.device_get(table)).max(axis=1)
-        alike = farthest is not None and bool(ALIKE * farthest.min() >= farthest.max())
-        return dataclasses.replace(self, table=table, alike=alike)
 
     @property
     def asked(self) -> str:

@@ -13,7 +13,7 @@ from jax.tree_util import KeyPath
 
 from jfrnn._geometry.batch import Batch
 from jfrnn._geometry.box import Box, check_box_range
-from jfrnn._geometry.cutoffs import RANGE_OF, RULES, SUM, TABLE, Radii, is_radius
+from jfrnn._geometry.cutoffs import ALIKE, RANGE_OF, RULES, SUM, TABLE, Radii, is_radius
 from jfrnn._tracing import Given, Real, Tree, as_array, as_dtype, gather, make_on_host, on_device, refuse_forks
 
 _MOST_POINTS = 2**31 - 32
@@ -211,7 +211,15 @@ def check_species(cutoff: Given, species: Given, rule: object, sources: Array, q
         wrong = known[(known < 0) | (known >= len(table))]
         if wrong.size:
             raise ValueError(f"{name} must be numbers of species from 0 to {len(table) - 1}, the rows of cutoff, got {wrong[0]}.")
-    return Radii(of_sources, of_queries, TABLE).with_table(table)
+    return Radii(of_sources, of_queries, TABLE, table=table, alike=_reach_alike(table))
+
+
+def _reach_alike(table: Array) -> bool:
+    """Say whether cutoffs of pairs of species are known, and no species reaches more than `ALIKE` times as far as another."""
+    if isinstance(table, Tracer):
+        return False
+    farthest = np.asarray(jax.device_get(table)).max(axis=1)
+    return bool(ALIKE * farthest.min() >= farthest.max())
 
 
 def check_table(cutoff: Given, like: Array, kinds: int | None = None) -> Array:
