@@ -1,8 +1,7 @@
-"""Cell search on the CPU: a serial counting sort, then queries on every core, 8 or 16 candidates at a time.
+"""Cell search on the CPU: a counting sort, then queries on every core, 8 or 16 candidates at a time.
 
-`build` sorts the sources (and the queries, if they are others) by cell. `gather` puts the coordinates of many sources into that
-order: to read them from anywhere takes longer than all that `build` does. Threads that run it or `query` hand
-themselves chunks of places from an atomic counter (see `native/walk/walk_cpu.h`).
+`build` sorts few sources (and the queries, if they are others) by cell; many are sorted by all threads, in steps of their own
+(`native/cells/cells_cpu.h`). Threads hand themselves chunks of particles, or of places, from an atomic counter.
 """
 
 import functools
@@ -13,13 +12,16 @@ from jfrnn.kernels._program import Kernel
 CHUNK = 2048  # places that a thread takes at a time, where it puts them in order
 QUERY_CHUNK = 256  # and where it serves queries
 _HEADER_WORDS = 64
-MANY = 1 << 15  # sources from which several threads gather their coordinates
+MANY = 1 << 15  # sources or queries from which several threads sort them
+SORT_CHUNK = 4096  # of them, that a thread takes at a time
+BUCKETS = 256  # of cells, into which they are dealt before each bucket is sorted
 FEW = 160  # sources up to which all are candidates of all queries
 ENTRIES = 16  # of the table, for each system with a box of its own, beyond those for its sources
 TOGETHER = 12  # queries that cells of a row are served for at once
 CANDIDATES = {False: 1536, True: 1024}  # by width: what fits into a first-level cache beside a row
+STEPS = ("build", "find_keys", "deal", "settle")  # of a sort
 GRID = {"FEW": FEW, "REACH": 1, "REACH_X": 2}  # finer cells along x alone: fewer candidates, but no more rows that are copied
-CHUNKS = {"CHUNK": CHUNK, "QUERY_CHUNK": QUERY_CHUNK, "MANY": MANY}
+CHUNKS = {"CHUNK": CHUNK, "QUERY_CHUNK": QUERY_CHUNK, "MANY": MANY, "SORT_CHUNK": SORT_CHUNK}
 
 
 def scratch_words(sources: int, queries: int, dim: int, width: int, own: bool, systems: int = 0) -> int:
@@ -28,10 +30,16 @@ def scratch_words(sources: int, queries: int, dim: int, width: int, own: bool, s
     `width` is 1 for float32 and 2 for float64; `systems` is how many there are with boxes of their own.
     """
     table = table_cells(sources) + ENTRIES * systems
-    parts = [_HEADER_WORDS, *[width * sources] * dim, sources, table + 2, max(sources, queries)]
+    most = max(sources, queries)
+    parts = [_HEADER_WORDS, *[width * sources] * dim, sources, table + 2, most, count_words(most)]
     if not own:
-        parts += [queries, table + 2]
+        parts += [queries, table + 2, most, most]
     return place_parts(parts)
+
+
+def count_words(most: int) -> int:
+    """Return the int32 words for what is counted while so many sources, or queries, are sorted."""
+    return 0 if most < MANY else (BUCKETS + 1) * -(-most // SORT_CHUNK)
 
 
 def grid_words(systems: int, width: int) -> int:
@@ -40,14 +48,13 @@ def grid_words(systems: int, width: int) -> int:
 
 
 @functools.lru_cache(128)
-def sort_kernels(kind: Kind) -> tuple[Kernel, Kernel]:
-    """Return what sorts: `build`, and `gather`, which is for `MANY` sources and more, and whose work threads share.
+def sort_kernels(kind: Kind) -> tuple[Kernel, ...]:
+    """Return what sorts: `build`, and `find_keys`, `deal` and `settle`, which are for `MANY` and whose work threads share.
 
     They are a program of their own: sums take no others, and to compile rows takes long.
     """
     kind, constants = kind.only("scaled", "periodic", "batched"), {**GRID, "SUMS": 0, "LIST": 0, **CHUNKS}
-    build, gather = declare_kind(kind, "sort_cpu", "cells_cpu.h", "Sort.build", "Sort.gather", constants=constants)
-    return build, gather
+    return tuple(declare_kind(kind, "sort_cpu", "cells_cpu.h", *(f"Sort.{step}" for step in STEPS), constants=constants))
 
 
 @functools.lru_cache(512)

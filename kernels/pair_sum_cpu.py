@@ -16,7 +16,7 @@ from typing import NamedTuple
 from jfrnn.kernels import tree_cpu
 from jfrnn.kernels._native import Kind, declare_kind
 from jfrnn.kernels._program import Kernel
-from jfrnn.kernels.cells_cpu import CHUNK, GRID, QUERY_CHUNK, TOGETHER
+from jfrnn.kernels.cells_cpu import CHUNKS, GRID, QUERY_CHUNK, TOGETHER
 
 CACHE_BYTES = 40 << 10  # for candidates: most of a first-level cache, and a little of the second
 MOST_CANDIDATES = 1024
@@ -255,7 +255,7 @@ def sort_kernel(dim: int, double: bool) -> Kernel:
 
     Behind these stand columns of the coordinates and turns of the sources, if `reads_rows`, where any particle has turns.
     """
-    constants: dict[str, int] = {**GRID, "CHUNK": CHUNK, "MANY": 0}
+    constants: dict[str, int] = {**GRID, **CHUNKS}
     return declare_kind(Kind(dim, double), "sort_values", "sort_values.h", "SortValues.run", constants=constants)[0]
 
 
@@ -282,8 +282,8 @@ def query_kernel(kind: Kind, term: TermText, key: str) -> Kernel:
     operations = work(term.unshifted or term.text)
     works = operations > VERY_LITTLE_WORK
     constants = {"LIST": 0, **GRID, **constants_of(term, kind, by_rows=True)}
-    constants |= {"COLUMNS": len(term.other_columns), "READS_ROWS": term.reads_rows, "CHUNK": CHUNK, "QUERY_CHUNK": QUERY_CHUNK}
-    constants |= {"CANDIDATES": _candidates(term, kind.dim, kind.double), "MANY": 0, "PACKED": operations > LITTLE_WORK}
+    constants |= {"COLUMNS": len(term.other_columns), "READS_ROWS": term.reads_rows, **CHUNKS}
+    constants |= {"CANDIDATES": _candidates(term, kind.dim, kind.double), "PACKED": operations > LITTLE_WORK}
     constants |= {"SKIPPED": works, "TOGETHER": TOGETHER_AT_WORK if works else TOGETHER, **(tree_cpu.TREE if kind.rule else {})}
     given = term_header(term, kind.double, by_rows=True) | (tree_cpu.PROVIDER if kind.rule else {})
     return declare_kind(kind.compiled(), f"pair_sum_cpu_{key}", "pair_sum_cpu.h", "Sums.run", given=given, constants=constants)[0]

@@ -1,8 +1,8 @@
 """Search on the CPU where cutoffs differ: in cells where they are alike, else in a tree of boxes around sources along a curve.
 
-`build` decides which, by a sample (`cutoffs_cpu.h`): cells find the candidates of queries in half the time, if what they
-hold beyond what is near is not many times as much. It sorts sources and queries by cell, or along a curve and makes the tree
-(`tree_cpu.h`); `gather` puts many sources in order. Then threads hand themselves chunks of queries: those that follow each
+A sample decides which (`cutoffs_cpu.h`): cells find the candidates of queries in half the time, if what they hold beyond
+what is near is not many times as much. Sources and queries are sorted by cell, or along a curve below the tree
+(`tree_cpu.h`). Then threads hand themselves chunks of queries: those that follow each
 other, and whose cutoffs are alike, find the cells (`cell_walk_cpu.h`) or the leaves (`tree_walk_cpu.h`) that are near
 all of them, and meet their sources (`walk_cpu.h`). So time follows pairs and particles, whatever the spread of cutoffs is,
 and whatever the density.
@@ -35,9 +35,20 @@ def scratch_words(sources: int, queries: int, dim: int, width: int, own: bool, s
         count = -(-count // FANOUT)
     most = max(sources, queries)
     table = table_cells(sources) + cells_cpu.ENTRIES * systems + 2
-    parts = [64, *[width * sources] * dim, sources, table, most, queries, table]  # those of cells
+    parts = [
+        64,
+        *[width * sources] * dim,
+        sources,
+        table,
+        most,
+        cells_cpu.count_words(most),
+        queries,
+        table,
+        most,
+        most,
+    ]  # of cells
     parts += [width * (sources + _MOST_LANES), sources + _MOST_LANES, sources, width * queries]
-    parts += [*[width * (nodes + _MOST_LANES)] * (2 * dim + 1), most, most]
+    parts += [width * (nodes + _MOST_LANES)] * (2 * dim + 1)
     return place_parts(parts)
 
 
@@ -52,11 +63,13 @@ def _constants(kind: Kind) -> dict[str, int]:
 
 
 @functools.lru_cache(128)
-def sort_kernels(kind: Kind) -> tuple[Kernel, Kernel]:
-    """Return `build` and `gather`, as `jfrnn.kernels.cells_cpu.sort_kernels` does."""
-    kind, entries = kind.only("scaled", "periodic", "batched", "rule"), ("CutoffSort.build", "TreePlaces.gather")
-    build, gather = declare_kind(kind, "sort_tree_cpu", "cutoffs_cpu.h", *entries, constants=_constants(kind))
-    return build, gather
+def sort_kernels(kind: Kind) -> tuple[Kernel, ...]:
+    """Return what sorts, as `jfrnn.kernels.cells_cpu.sort_kernels` does; then `choose`, and `gather`, whose work threads share."""
+    kind, entries = (
+        kind.only("scaled", "periodic", "batched", "rule"),
+        (f"CutoffSort.{step}" for step in (*cells_cpu.STEPS, "choose")),
+    )
+    return tuple(declare_kind(kind, "sort_tree_cpu", "cutoffs_cpu.h", *entries, "TreePlaces.gather", constants=_constants(kind)))
 
 
 @functools.lru_cache(512)

@@ -104,7 +104,7 @@ def _cpu_callable(kind: Kind) -> Call:
 def _plan_on_cpu(kind: Kind, shapes: Shapes, _: int) -> Plan:
     query = (tree_cpu if kind.rule else cells_cpu).query_kernel(kind)
     numbers = _with_table(plan_numbers(kind, shapes), shapes)
-    return Plan([*sort_on_cpu(kind, numbers["n"]), *huge_pages(kind, shapes), share(query, numbers["m"])], numbers, absent(kind))
+    return Plan([*sort_on_cpu(kind, shapes, numbers), *huge_pages(kind, shapes), share(query, numbers["m"])], numbers, absent(kind))
 
 
 def _with_table(numbers: dict[str, int], shapes: Shapes) -> dict[str, int]:
@@ -239,7 +239,7 @@ def _plan_sums_on_cpu(kind: Kind, term: TermText, key: str, shapes: Shapes, _: i
     numbers = _with_table(size_numbers(shapes, kind.own), shapes) | flags | numbers_of_values(term, shapes)
     values = [share(pair_sum_cpu.sort_kernel(kind.dim, kind.double), numbers["n"])] if term.source_columns else []
     query = share(pair_sum_cpu.query_kernel(kind, term, key), numbers["m"])
-    return Plan([*sort_on_cpu(kind, numbers["n"]), *values, query], numbers)
+    return Plan([*sort_on_cpu(kind, shapes, numbers), *values, query], numbers)
 
 
 @kernel

@@ -10,7 +10,7 @@ from jax import Array
 from jfrnn._engine.kept_warp import numbers_of_pairs
 from jfrnn._engine.launch import Call, Shapes, kernel
 from jfrnn._engine.operands import as_integer, scalar_of
-from jfrnn._engine.plans import Clear, Launch, Plan, share
+from jfrnn._engine.plans import Clear, Launch, Plan, ask_for_huge_pages, share
 from jfrnn._engine.problem import Inputs, Options, Search, bits_of, prepare_search
 from jfrnn._geometry import FAR, FAR_BITS, FAR_STEP, LARGEST_TURN, NOT_FINITE, TOO_FAR, Lattice, NearRows
 from jfrnn._tracing import compile_program, on_platform
@@ -53,7 +53,8 @@ def _callable(dim: int, double: bool, skewed: bool, cuda: bool) -> Call:
         n, found = shapes["points"][0], near.near_kernel(dim, double, skewed, tuple(constants_of_far(double).items()), cuda)
         if cuda:
             return Plan([Clear("met", 8), Launch(found, near.threads(n, multiprocessors))], {"n": n})
-        return Plan([Clear("met", 8), Clear("info", 8), share(found, n, near.POINTS_AT_ONCE)], {"n": n})
+        pages = ask_for_huge_pages("rows", (8 if double else 4) * n * (dim + 1))
+        return Plan([Clear("met", 8), Clear("info", 8), *pages, share(found, n, near.POINTS_AT_ONCE)], {"n": n})
 
     name = f"jfrnn_near_{'cuda' if cuda else 'cpu'}_{dim}d_{'f64' if double else 'f32'}{'_skewed' * skewed}"
     results = {"rows": scalar_of(Kind(dim, double)), "met": np.int32, "info": np.int32}

@@ -243,10 +243,18 @@ def huge_pages(kind: Kind, shapes: Shapes) -> list[HugePages]:
     return [step for name in names for step in ask_for_huge_pages(name, 4 * math.prod(shapes[name]))]
 
 
-def sort_on_cpu(kind: Kind, n: int) -> list[Launch]:
-    """Return what sorts sources and queries on the CPU; several threads put the coordinates of many sources in order."""
-    build, gather = (tree_cpu if kind.rule else cells_cpu).sort_kernels(kind)
-    return [Launch(build), *([share(gather, n)] if n >= cells_cpu.MANY else [])]
+def sort_on_cpu(kind: Kind, shapes: Shapes, numbers: Mapping[str, int]) -> list[HugePages | Launch]:
+    """Return what sorts sources and queries on the CPU, of numbers of a plan; several threads sort many."""
+    pages = ask_for_huge_pages("scratch", 4 * math.prod(shapes["scratch"]))
+    build, *steps = (tree_cpu if kind.rule else cells_cpu).sort_kernels(kind)
+    of_sources, of_queries = ({"of_queries": which} for which in (0, 1))
+    if max(numbers["n"], numbers["m"]) < cells_cpu.MANY:
+        return [*pages, Launch(build, numbers=of_sources)]
+    shared, rest = steps[:3], steps[3:]
+    both = [(numbers["n"], of_sources), *([] if numbers["own"] else [(numbers["m"], of_queries)])]
+    sorts = [share(step, count)._replace(numbers=which) for count, which in both for step in shared]
+    choose = [Launch(rest[0], numbers=of_sources), share(rest[1], numbers["n"])._replace(numbers=of_sources)] if rest else []
+    return [*pages, Launch(build, numbers=of_sources), *sorts, *choose]
 
 
 def size_numbers(shapes: Shapes, own: bool) -> dict[str, int]:

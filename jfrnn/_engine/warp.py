@@ -321,5 +321,5 @@ def place_launches(launches: Sequence[cells_cuda.Launch]) -> list[Launch]:
 def _plan_on_cpu(kind: Kind, shapes: Shapes, _: int) -> Plan:
     """Return what is launched on the CPU: among cells or, where cutoffs differ, in a tree."""
     numbers, query = plan_numbers(kind, shapes), (tree_cpu if kind.rule else cells_cpu).query_kernel(kind)
-    steps = [*sort_on_cpu(kind, numbers["n"]), *huge_pages(kind, shapes), share(query, numbers["m"], QUERIES_PER_THREAD)]
+    steps = [*sort_on_cpu(kind, shapes, numbers), *huge_pages(kind, shapes), share(query, numbers["m"], QUERIES_PER_THREAD)]
     return Plan(steps, numbers, absent(kind))

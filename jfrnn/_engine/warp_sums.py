@@ -92,7 +92,7 @@ def _cpu_callable(kind: Kind, term: TermText, key: str) -> Call:
         numbers = _numbers(kind, term, shapes) | numbers_of_values(term, shapes)
         values = [share(pair_sum_cpu.sort_kernel(kind.dim, kind.double), numbers["n"])] if term.source_columns else []
         query = share(pair_sum_cpu.query_kernel(kind, term, key), numbers["m"], QUERIES_PER_THREAD)
-        return Plan([*sort_on_cpu(kind, numbers["n"]), *values, query], numbers)
+        return Plan([*sort_on_cpu(kind, shapes, numbers), *values, query], numbers)
 
     return describe_sums("pair_sum_cpu", kind, key, plan, _GIVEN, more={"columns": scalar_of(kind), **_WORDS})
 

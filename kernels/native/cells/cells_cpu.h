@@ -1,17 +1,29 @@
 // How sources (and queries, if they are others) are sorted by cell on the CPU, and where things lie in the scratch meanwhile.
+//
+// One thread sorts few by counting. Many are sorted by all threads, in three steps, in each of which threads hand themselves parts:
+// chunks of particles find their cells (`find_keys`), and go to buckets of cells that follow each other (`deal`); buckets, each of
+// which fits into a cache, are sorted by counting (`settle`). The order is the same either way: particles of a cell keep theirs.
 #pragma once
 #include "cells.h"
 #include "chunks.h"
 
+constexpr int BUCKETS = 256;        // of cells, as in jfrnn/kernels/cells_cpu.py; one more is for particles that are not finite
 constexpr int SAMPLED = 256;        // cutoffs, and coordinates, that tell what is typical
 constexpr int MOST_OUTSIDE = 4096;  // sources outside of the box of cells, where a box of all would be too large
 
+// Parts that threads have taken of each step of a sort, and how many particles have found their cells.
+struct Hands {
+    int finding, dealing, settling, found;
+};
 struct Shared {
     Grid grid;
     int finite_queries;
     int next_chunk;
-    int next_gathered, next_sorted;  // chunks of sources whose coordinates and values are put in order
+    int next_gathered, next_sorted;  // chunks of sources that are put in order, and of their values
     int gathered;                    // sources that are
+    Hands hands[2];                  // for sources, and for queries
+    int bucket_bits;                 // of a cell's number, below those of its bucket's
+    int low_bit, minus_high;         // the lowest bit of all coordinates, and the largest exponent, negated
     int turned;                      // of a periodic box: 0 if all particles lie in its cell, 1 if in those beside it, else 2
     real unit;                       // of the lattice on which all coordinates lie, or 0
     real cells_for;                  // where cutoffs differ: that for which cells are wide, or 0: sources stand in a tree
@@ -22,7 +34,9 @@ struct Scratch {
     Shared& shared;
     real* axis[3];           // coordinates of sources, in the order of cells
     int *ids, *start, *key;  // sources in the order of cells, first places of cells, cells of particles
+    int* counts;             // of many particles: how many each chunk has for each bucket, then where the next one goes
     int *query_ids, *query_start;
+    int *others, *order;  // keys and numbers, while queries are sorted
     int* cursor;
 
     Scratch(int* scratch, int n, int m, int own, int table) : shared(*(Shared*)scratch), cursor(scratch + up(64)) {
@@ -31,9 +45,13 @@ struct Scratch {
             axis[k] = (real*)take(WIDTH * (long long)n);
         ids = take(n);
         start = take(table + 2);
-        key = take(n > m ? n : m);
+        const int most = n > m ? n : m;
+        key = take(most);
+        counts = take(most < MANY ? 0 : (BUCKETS + 1) * ((most + SORT_CHUNK - 1ll) / SORT_CHUNK));
         query_ids = own ? ids : take(m);
         query_start = own ? start : take(table + 2);
+        others = own ? nullptr : take(most);
+        order = own ? nullptr : take(most);
     }
     static long long up(long long words) { return (words + 15) & ~15ll; }
     int* take(long long words) {
@@ -90,14 +108,39 @@ struct Places : SystemCells, Scratch {
 struct SortArguments {
     const real *positions, *queries, *cutoff;
     int *longest, *bits, *scratch, *grids;
-    int n, m, own, table;
+    int n, m, own, table, of_queries;
 };
 
-// Sorts by counting: `build` is of one thread, which reads every particle three times.
+// What is sorted: points, in rows; where their order and the first places of cells go, and keys and numbers of those that are dealt.
+struct Sorted {
+    const real* rows;
+    int count;
+    int *first, *order, *keys, *numbers;
+    int stride;  // of both
+    Hands& hands;
+};
+
+// `build` is of one thread, which sorts few. Of many it says where cells are, and `find_keys`, `deal` and `settle` follow.
 struct Sort : SortArguments, Places {
     explicit Sort(const SortArguments& given) : SortArguments(given), Places(given) {}
+    bool many() const { return n >= MANY || m >= MANY; }
 
     void build() {
+        lay_out_cells();
+        *bits = 0;
+        if (many())
+            return;
+        int lowest = 1 << 20, highest = 0;
+        look_at_bits(positions, 0, n, lowest, highest);
+        if (!own)
+            look_at_bits(queries, 0, m, lowest, highest);
+        shared.unit = BOXES ? real(0) : lattice_unit(lowest, highest);
+        sort_few();
+        for (int place = 0; place < n; ++place)
+            put_coordinates(positions, ids[place], place);
+    }
+    // Says where cells are, for `find_keys`, and what is known before.
+    void lay_out_cells() {
         Grid grid;
         if constexpr (BOXES)
             lay_out_boxes(grid);
@@ -110,19 +153,27 @@ struct Sort : SortArguments, Places {
             if (!grid.dense && !one_cell && n > 0)
                 leave_out_few(grid, low, high);
         }
-        shared.next_chunk = 0;
-        shared.next_gathered = shared.next_sorted = 0;
+        begin(grid);
         if (longest)  // of a sum there is none
             *longest = 0;
         note_turns();
-        int lowest = 1 << 20, highest = 0;
-        look_at_bits(positions, n, lowest, highest);
-        if (!own)
-            look_at_bits(queries, m, lowest, highest);
-        shared.unit = BOXES ? real(0) : lattice_unit(lowest, highest);
-        grid.finite = sort(grid, positions, n, start, ids, true);
+    }
+    void begin(const Grid& grid) {
+        shared.next_chunk = shared.next_gathered = shared.next_sorted = shared.gathered = 0;
+        shared.hands[0] = shared.hands[1] = Hands{};
+        shared.low_bit = 1 << 20;
+        shared.minus_high = 0;
         shared.grid = grid;
-        shared.finite_queries = own ? grid.finite : sort(grid, queries, m, query_start, query_ids, false);
+        shared.unit = 0;
+        shared.bucket_bits = 0;
+        while (grid.cells > BUCKETS << shared.bucket_bits)
+            ++shared.bucket_bits;
+    }
+    // Sorts sources and queries, where there are few.
+    void sort_few() {
+        Grid& grid = shared.grid;
+        grid.finite = sort(grid, positions, n, start, ids);
+        shared.finite_queries = own ? grid.finite : sort(grid, queries, m, query_start, query_ids);
         *bits = grid.finite < n || shared.finite_queries < m ? 2 : 0;
     }
 
@@ -242,9 +293,9 @@ struct Sort : SortArguments, Places {
     }
 
     // Finds the lowest bit and the largest exponent of all coordinates, as they were given; whatever lies on no lattice shows soon.
-    void look_at_bits(const real* points, int count, int& lowest, int& highest) const {
+    void look_at_bits(const real* points, int from, int to, int& lowest, int& highest) const {
         const int too_low = Bits::exponent(radius) - Bits::BIAS - UNITS;
-        for (int i = 0; i < count && lowest >= too_low; ++i) {
+        for (int i = from; i < to && lowest >= too_low; ++i) {
             const real* row = points + (long long)ROW * i;
             if (!finite_point(row))
                 continue;
@@ -256,57 +307,152 @@ struct Sort : SortArguments, Places {
         }
     }
 
-    // Sorts points by cell into `order`, with the first place of each cell in `first`; points that are not finite come last. Returns
-    // how many are finite.
-    int sort(const Grid& grid, const real* points, int count, int* first, int* order, bool with_axes) {
-        count_cells(grid, points, count, first);
-        return put_in_cells(grid, points, count, first, order, with_axes);
+    // The cell of a point, -1 if it is not finite.
+    int key_of(const Grid& grid, const real* row) {
+        real p[3];
+        enter(system_of(row));
+        point_of(row, p);
+        const Grid& there = BOXES ? grid_of[here].grid : grid;
+        return finite_point(p) ? first_cell() + cell_key(there, p, system_of(row)) : -1;
     }
-    // Notes the cell of each point, and how many points each cell has two entries behind its own.
-    void count_cells(const Grid& grid, const real* points, int count, int* first) {
+    // Sorts few points by cell into `order`, with the first place of each cell in `first`; points that are not finite come last. Returns
+    // how many are finite.
+    int sort(const Grid& grid, const real* points, int count, int* first, int* order) {
         int* const key = this->key;  // stays in a register, whatever is stored
-        for (int c = 0; c < grid.cells + 2; ++c)
+        const int cells = grid.cells;
+        for (int c = 0; c < cells + 2; ++c)
             first[c] = 0;
         for (int i = 0; i < count; ++i) {
-            real p[3];
-            enter(system_of(points + (long long)ROW * i));
-            point_of(points + (long long)ROW * i, p);
-            const Grid& there = BOXES ? grid_of[here].grid : grid;
-            const int cell = finite_point(p) ? first_cell() + cell_key(there, p, system_of(points + (long long)ROW * i)) : -1;
-            key[i] = cell;
-            if (cell >= 0)
-                ++first[cell + 2];
+            key[i] = key_of(grid, points + (long long)ROW * i);
+            if (key[i] >= 0)
+                ++first[key[i] + 2];
         }
+        for (int c = 2; c < cells + 2; ++c)
+            first[c] += first[c - 1];
+        const int finite = first[cells + 1];
+        for (int i = 0, behind = finite; i < count; ++i)
+            order[key[i] >= 0 ? first[key[i] + 1]++ : behind++] = i;
+        return finite;
     }
     // Notes how far away from the cell any particle lies.
     void note_turns() {
         const real most = lattice.most_turns();
         shared.turned = most < 2 ? (int)most : 2;
     }
-    // Coordinates of few sources are put in order at once, those of many by several threads (`gather`).
-    int put_in_cells(const Grid& grid, const real* points, int count, int* first, int* order, bool with_axes) {
-        const int* const key = this->key;
-        const int cells = grid.cells;
-        for (int c = 2; c < cells + 2; ++c)
-            first[c] += first[c - 1];
-        const int finite = first[cells + 1];
-        for (int i = 0, behind = finite; i < count; ++i) {
-            const int place = key[i] >= 0 ? first[key[i] + 1]++ : behind++;
-            order[place] = i;
-            if (with_axes && n < MANY)
-                put_coordinates(points, i, place);
-        }
-        return finite;
+
+    // --- many, by several threads: each step is launched once per thread ---
+
+    // What is sorted, sources or queries. While sources are dealt, their keys and numbers lie where their coordinates will.
+    Sorted sorted() {
+        if (of_queries)
+            return {queries, m, query_start, query_ids, others, order, 1, shared.hands[1]};
+        return {positions, n, start, ids, (int*)axis[0], (int*)axis[1], DOUBLE ? 2 : 1, shared.hands[0]};
     }
-    // Puts coordinates of many sources into the order of cells. It is launched once per thread: threads hand themselves chunks of
-    // places. Reading from anywhere is what takes time, so rows are fetched ahead.
-    void gather() {
-        each_chunk(shared.next_gathered, n, CHUNK, [&](int from, int to, int) {
+    int bucket_of(int key) const { return key < 0 ? BUCKETS : key >> shared.bucket_bits; }
+    static int chunks(int count) { return count ? (count - 1) / SORT_CHUNK + 1 : 1; }
+
+    void find_keys() {
+        const Sorted points = sorted();
+        each_chunk(points.hands.finding, points.count ? points.count : 1, SORT_CHUNK, [&](int from, int to, int chunk) {
+            int* const counts = this->counts + (BUCKETS + 1) * chunk;
+            const Grid grid = shared.grid;
+            to = to < points.count ? to : points.count;
+            for (int b = 0; b <= BUCKETS; ++b)
+                counts[b] = 0;
+            for (int i = from; i < to; ++i) {
+                key[i] = key_of(grid, points.rows + (long long)ROW * i);
+                ++counts[bucket_of(key[i])];
+            }
+            note_bits(points.rows, from, to);
+            if (__atomic_add_fetch(&points.hands.found, 1, __ATOMIC_ACQ_REL) == chunks(points.count))
+                add_up(points);
+        });
+    }
+    void note_bits(const real* rows, int from, int to) {
+        int lowest = __atomic_load_n(&shared.low_bit, __ATOMIC_RELAXED), highest = 0;
+        look_at_bits(rows, from, to, lowest, highest);
+        lower(shared.low_bit, lowest);
+        lower(shared.minus_high, -highest);
+    }
+    static void lower(int& least, int value) {
+        int there = __atomic_load_n(&least, __ATOMIC_RELAXED);
+        while (value < there && !__atomic_compare_exchange_n(&least, &there, value, true, __ATOMIC_RELAXED, __ATOMIC_RELAXED)) {}
+    }
+    // Finds where the first point goes that each chunk has for each bucket.
+    void add_up(const Sorted& points) {
+        int next[BUCKETS + 1] = {}, *const end = counts + (BUCKETS + 1) * chunks(points.count);
+        for (int* of = counts; of < end; of += BUCKETS + 1)
+            for (int b = 0; b <= BUCKETS; ++b)
+                next[b] += of[b];
+        for (int b = 0, place = 0; b <= BUCKETS; ++b) {
+            const int there = next[b];
+            next[b] = place;
+            place += there;
+        }
+        const int finite = next[BUCKETS];
+        for (int* of = counts; of < end; of += BUCKETS + 1)
+            for (int b = 0; b <= BUCKETS; ++b) {
+                const int there = of[b];
+                of[b] = next[b];
+                next[b] += there;
+            }
+        points.first[shared.grid.cells] = finite;
+        if (!of_queries)
+            shared.grid.finite = finite;
+        if (of_queries || own)
+            shared.finite_queries = finite;
+        if (finite < points.count)
+            *bits = 2;
+        shared.unit = BOXES ? real(0) : lattice_unit(shared.low_bit, -shared.minus_high);
+    }
+    void deal() {
+        const Sorted points = sorted();
+        each_chunk(points.hands.dealing, points.count, SORT_CHUNK, [&](int from, int to, int chunk) {
+            int* const next = counts + (BUCKETS + 1) * chunk;
+            for (int i = from; i < to; ++i) {
+                const long long place = next[bucket_of(key[i])]++;
+                points.keys[points.stride * place] = key[i];
+                points.numbers[points.stride * place] = i;
+            }
+        });
+    }
+    void settle() {
+        settle([&](int from, int to) {
             for (int place = from; place < to; ++place) {
-                constexpr int AHEAD = 16;  // places
-                __builtin_prefetch(positions + (long long)ROW * ids[place + AHEAD < n ? place + AHEAD : place]);
+                constexpr int AHEAD = 16;  // places: reading from anywhere is what takes time
+                __builtin_prefetch(positions + (long long)ROW * ids[place + AHEAD < to ? place + AHEAD : place]);
                 put_coordinates(positions, ids[place], place);
             }
         });
+    }
+    // Sorts buckets; `put` puts what is known of the sources at places [from, to) in order.
+    template <class Put>
+    void settle(Put put) {
+        const Sorted points = sorted();
+        const int* const ends = counts + (BUCKETS + 1) * (chunks(points.count) - 1);
+        each_chunk(points.hands.settling, BUCKETS + 1, 1, [&](int bucket, int, int) {
+            const int from = bucket ? ends[bucket - 1] : 0, to = ends[bucket];
+            settle_bucket(points, bucket, from, to);
+            if (!of_queries)
+                put(from, to);
+        });
+    }
+    void settle_bucket(const Sorted& points, int bucket, int from, int to) {
+        const long long stride = points.stride, cells = shared.grid.cells, begins = (long long)bucket << shared.bucket_bits;
+        const long long ends = begins + (1ll << shared.bucket_bits) < cells ? begins + (1ll << shared.bucket_bits) : cells;
+        int *const first = points.first, *const order = points.order;
+        if (bucket == BUCKETS) {
+            for (int place = from; place < to; ++place)
+                order[place] = points.numbers[stride * place];
+            return;
+        }
+        for (long long c = begins; c < ends; ++c)
+            first[c] = 0;
+        for (int place = from; place < to; ++place)
+            ++first[points.keys[stride * place]];
+        for (long long c = begins, place = from; c < ends; ++c)
+            first[c] = (int)(place += first[c]);
+        for (int place = to - 1; place >= from; --place)  // the last first, so that points of a cell keep their order
+            order[--first[points.keys[stride * place]]] = points.numbers[stride * place];
     }
 };

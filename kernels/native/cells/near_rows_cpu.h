@@ -10,9 +10,8 @@ struct NearRows : FloatControl, NearRow {  // in this order: nothing is flushed 
         each_chunk(*info, n, CHUNK, [&](int from, int to, int) {
             int found = 0;
             for (int i = from; i < to; ++i) {
-                if constexpr (SKEWED)
-                    while (i + LANES <= to && write_lanes(i, found))
-                        i += LANES;
+                while (i + LANES <= to && write_lanes(i, found))
+                    i += LANES;
                 found = i < to ? Near::joined(found, write(i)) : found;
             }
             int known = __atomic_load_n(met, __ATOMIC_RELAXED), both;
@@ -31,7 +30,7 @@ struct NearRows : FloatControl, NearRow {  // in this order: nothing is flushed 
         unsigned int usual = lanes_before(LANES);
         for (int axis = 0; axis < DIM; ++axis) {
             vec turns{}, size{};
-            for (int k = 0; k < DIM; ++k) {
+            for (int k = SKEWED ? 0 : axis; k < (SKEWED ? DIM : axis + 1); ++k) {
                 const vec product = (point[k] - near.origin[k]) * near.transform[k][axis];
                 turns = turns + product;  // apart: rounded as one point is
                 size += __builtin_elementwise_abs(point[k] * near.transform[k][axis]);

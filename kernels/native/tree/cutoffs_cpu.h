@@ -17,55 +17,78 @@ struct CutoffSort : TreeSortArguments {
 
     void build() {
         Shared& shared = cells.shared;
-        shared.next_chunk = shared.next_gathered = shared.next_sorted = shared.gathered = 0;
-        shared.unit = shared.cells_for = 0;
-        if (longest)
-            *longest = 0;
+        *bits = 0;
         if constexpr (BOXES) {  // by cells that are wide enough for the largest cutoff of each system
-            cells.build();
+            cells.lay_out_cells();
             shared.cells_for = 1;
-            if (n < MANY)
-                TreePlaces(*this).put_in_order(0, n);
-            return;
+        } else {
+            Grid grid;
+            const real width = lay_out(grid);
+            cells.begin(grid);
+            cells.note_turns();
+            shared.cells_for = width;
+            if (longest)
+                *longest = 0;
         }
-        cells.note_turns();
-        if (!sort_by_cells())
+        if (cells.many())
+            return;
+        if (in_cells())
+            cells.sort_few();
+        choose();
+        if (in_cells())
+            TreePlaces(*this).put_in_order(0, n);
+    }
+    // The steps in which several threads sort many, each launched once per thread.
+    void find_keys() {
+        if (in_cells())
+            cells.find_keys();
+    }
+    void deal() {
+        if (in_cells())
+            cells.deal();
+    }
+    void settle() {
+        TreePlaces places(*this);
+        if (in_cells())
+            cells.settle([&](int from, int to) { places.put_in_order(from, to); });
+    }
+    // Goes on with a tree where cells are worse, which is known once they are sorted.
+    void choose() {
+        cells.shared.unit = 0;  // that one cutoff is a multiple of it tells nothing
+        if constexpr (BOXES)
+            return;
+        if (in_cells() && !cells.one_cell && !are_alike(cells.shared.cells_for))
+            cells.shared.cells_for = 0;
+        if (!in_cells())
             tree();
     }
     JFRNN_APART void tree() { TreeSort(*this).build(); }
+    // Returns whether sources stand in cells, as far as is known, and lets them be as wide as was said.
+    bool in_cells() {
+        const real width = cells.shared.cells_for;
+        if (width > 0)
+            cells.set_cutoff_of_cells(width);
+        return width > 0;
+    }
 
-    // Returns whether cells are as good as a tree; only then all is sorted by them.
-    bool sort_by_cells() {
+    // Lays out cells. Returns the cutoff for which they are, 0 if there are too many.
+    real lay_out(Grid& grid) {
         const real typical = PERIODIC || !BY_OWN ? cells.radius : typical_cutoff();
         real low[3], high[3];
-        if (!(typical > 0 && 2 * REACH_X / typical < __builtin_inff()))
-            return false;
+        if (!(typical > 0 && 2 * REACH_X / typical < __builtin_inff())) {
+            grid = Grid{};
+            return 0;
+        }
         cells.set_cutoff_of_cells(typical);
         if (cells.find_bounds(low, high) == 0)
             for (int k = 0; k < DIM; ++k)
                 low[k] = high[k] = 0;
-        Grid grid;
         cells.lay_out(grid, low, high, table);
         if (!grid.dense && !cells.one_cell && n > 0) {
             cells.narrow(low, high);
             cells.lay_out(grid, low, high, table);
         }
-        if (!grid.dense)
-            return false;
-        cells.count_cells(grid, positions, n, cells.start);
-        if (!cells.one_cell && !are_alike(grid, typical))
-            return false;
-        grid.finite = cells.put_in_cells(grid, positions, n, cells.start, cells.ids, false);
-        Shared& shared = cells.shared;
-        shared.cells_for = typical;
-        shared.grid = grid;
-        shared.finite_queries = grid.finite;
-        if (!own)
-            shared.finite_queries = cells.sort(grid, queries, m, cells.query_start, cells.query_ids, false);
-        *bits = grid.finite < n || shared.finite_queries < m ? 2 : 0;
-        if (n < MANY)
-            TreePlaces(*this).put_in_order(0, n);
-        return true;
+        return grid.dense ? typical : real(0);
     }
     real typical_cutoff() const {
         real r[SAMPLED];
@@ -74,19 +97,16 @@ struct CutoffSort : TreeSortArguments {
     }
     // Do queries meet few sources in the cells that they look into, beyond those that are near? As many are in the cells beside that
     // of a query as there are in its own, it is supposed.
-    bool are_alike(const Grid& grid, real typical) const {
+    bool are_alike(real typical) {
+        const Grid grid = cells.shared.grid;
         const int step = m / SAMPLES + 1;
         double met = 0, near = 0;
         for (int i = 0; i < m; i += step) {
-            int cell = own ? cells.key[i] : -1;
-            if (!own) {
-                real p[3];
-                cells.point_of(queries + (long long)ROW * i, p);
-                cell = finite_point(p) ? cells.cell_key(grid, p, system_of(queries + (long long)ROW * i)) : -1;
-            }
+            const int cell = cells.key_of(grid, queries + (long long)ROW * i);
             if (cell < 0)
                 continue;
-            const double there = cells.start[cell + 2], r = reach_of(i) / (double)typical, reach = BY_OWN && !PERIODIC ? r : 1;
+            const double there = cells.start[cell + 1] - cells.start[cell], r = reach_of(i) / (double)typical,
+                         reach = BY_OWN && !PERIODIC ? r : 1;
             double wide = 1, volume = DIM == 3 ? 4.19 : 3.14;
             for (int k = 0; k < DIM; ++k) {
                 wide *= 1 + 2 * reach;

@@ -21,7 +21,6 @@ struct TreeScratch : Scratch {
     int* place_of;      // where a source stands
     real* reach_there;  // of queries, in their order: cutoffs, which say how wide a group may be
     real *node_low[3], *node_high[3], *node_radius;
-    int *others, *order;                               // numbers, while they are sorted
     int levels, first[LEVELS + 1], nodes[LEVELS + 1];  // of each level: its first node, and how many there are
 
     TreeScratch(int* scratch, int n, int m, int, int table) : Scratch(scratch, n, m, 0, table) {
@@ -44,8 +43,6 @@ struct TreeScratch : Scratch {
             node_high[k] = (real*)take(WIDTH * (long long)(total + LANES));
         }
         node_radius = (real*)take(WIDTH * (long long)(total + LANES));
-        others = take(n > m ? n : m);
-        order = take(n > m ? n : m);
     }
     // The exponent of a cutoff, and the first bits behind the leading one.
     static int class_of(real r) { return (int)(Bits::of(r) >> (Bits::MANTISSA - CLASS_BITS)); }
@@ -139,10 +136,10 @@ struct TreePlaces : TreeSortArguments, SystemCells, TreeScratch {
     // Puts many sources in order. It is launched once per thread: threads hand themselves chunks of places, and the last one to end
     // makes the nodes above the leaves.
     void gather() {
+        if (shared.cells_for > 0)
+            return;
         each_chunk(shared.next_gathered, n, CHUNK, [&](int from, int to, int) {
             put_in_order(from, to);
-            if (shared.cells_for > 0)
-                return;
             make_leaves(from, to);
             if (__atomic_add_fetch(&shared.gathered, to - from, __ATOMIC_ACQ_REL) == n)
                 make_nodes();
@@ -167,7 +164,7 @@ struct TreeSort : TreePlaces {
             shared.finite_queries = sort(queries, m, query_ids);
         sort_by_reach(shared.finite_queries);
         *bits = finite < n || shared.finite_queries < m ? 2 : 0;
-        if (n < MANY) {
+        if (n < MANY && m < MANY) {
             put_in_order(0, n);
             make_leaves(0, n);
             make_nodes();
