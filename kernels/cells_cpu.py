@@ -5,6 +5,7 @@
 """
 
 import functools
+from typing import NamedTuple
 
 from jfrnn.kernels._native import Kind, declare_kind, place_parts, table_cells
 from jfrnn.kernels._program import Kernel
@@ -19,7 +20,7 @@ FEW = 160  # sources up to which all are candidates of all queries
 ENTRIES = 16  # of the table, for each system with a box of its own, beyond those for its sources
 TOGETHER = 12  # queries that cells of a row are served for at once
 CANDIDATES = {False: 1536, True: 1024}  # by width: what fits into a first-level cache beside a row
-STEPS = ("build", "find_keys", "deal", "settle")  # of a sort
+STEPS = ("find_keys", "deal", "settle")  # in which many are sorted
 GRID = {"FEW": FEW, "REACH": 1, "REACH_X": 2}  # finer cells along x alone: fewer candidates, but no more rows that are copied
 CHUNKS = {"CHUNK": CHUNK, "QUERY_CHUNK": QUERY_CHUNK, "MANY": MANY, "SORT_CHUNK": SORT_CHUNK}
 
@@ -47,14 +48,21 @@ def grid_words(systems: int, width: int) -> int:
     return systems * (6 * width + 10)
 
 
-@functools.lru_cache(128)
-def sort_kernels(kind: Kind) -> tuple[Kernel, ...]:
-    """Return what sorts: `build`, and `find_keys`, `deal` and `settle`, which are for `MANY` and whose work threads share.
+class SortKernels(NamedTuple):
+    """What sorts: `build`; where there are many, `steps`, whose work threads share; then, if cutoffs differ, `choose`, `gather`."""
 
-    They are a program of their own: sums take no others, and to compile rows takes long.
-    """
+    build: Kernel
+    steps: tuple[Kernel, ...]
+    more: tuple[Kernel, ...] = ()
+
+
+@functools.lru_cache(128)
+def sort_kernels(kind: Kind) -> SortKernels:
+    """Return what sorts, in programs of their own: sums take no others, and rows, or steps for many, take long to compile."""
     kind, constants = kind.only("scaled", "periodic", "batched"), {**GRID, "SUMS": 0, "LIST": 0, **CHUNKS}
-    return tuple(declare_kind(kind, "sort_cpu", "cells_cpu.h", *(f"Sort.{step}" for step in STEPS), constants=constants))
+    build = declare_kind(kind, "sort_cpu", "cells_cpu.h", "Sort.build", constants=constants)[0]
+    steps = declare_kind(kind, "sort_many_cpu", "cells_cpu.h", *(f"Sort.{step}" for step in STEPS), constants=constants)
+    return SortKernels(build, tuple(steps))
 
 
 @functools.lru_cache(512)

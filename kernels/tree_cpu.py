@@ -63,13 +63,13 @@ def _constants(kind: Kind) -> dict[str, int]:
 
 
 @functools.lru_cache(128)
-def sort_kernels(kind: Kind) -> tuple[Kernel, ...]:
-    """Return what sorts, as `jfrnn.kernels.cells_cpu.sort_kernels` does; then `choose`, and `gather`, whose work threads share."""
-    kind, entries = (
-        kind.only("scaled", "periodic", "batched", "rule"),
-        (f"CutoffSort.{step}" for step in (*cells_cpu.STEPS, "choose")),
-    )
-    return tuple(declare_kind(kind, "sort_tree_cpu", "cutoffs_cpu.h", *entries, "TreePlaces.gather", constants=_constants(kind)))
+def sort_kernels(kind: Kind) -> cells_cpu.SortKernels:
+    """Return what sorts, as `jfrnn.kernels.cells_cpu.sort_kernels` does, and `choose` and `gather`, whose work threads share."""
+    kind, constants = kind.only("scaled", "periodic", "batched", "rule"), _constants(kind)
+    entries, steps = ("CutoffSort.build", "CutoffSort.choose", "TreePlaces.gather"), (f"CutoffSort.{x}" for x in cells_cpu.STEPS)
+    build, *more = declare_kind(kind, "sort_tree_cpu", "cutoffs_cpu.h", *entries, constants=constants)
+    shared = declare_kind(kind, "sort_many_tree_cpu", "cutoffs_cpu.h", *steps, constants=constants)
+    return cells_cpu.SortKernels(build, tuple(shared), tuple(more))
 
 
 @functools.lru_cache(512)

@@ -245,20 +245,17 @@ def huge_pages(kind: Kind, shapes: Shapes) -> list[HugePages]:
 
 def sort_on_cpu(kind: Kind, shapes: Shapes, numbers: Mapping[str, int]) -> list[HugePages | Launch]:
     """Return what sorts sources and queries on the CPU, of numbers of a plan; several threads sort many."""
-    pages = ask_for_huge_pages("scratch", 4 * math.prod(shapes["scratch"]))
-    build, *steps = (tree_cpu if kind.rule else cells_cpu).sort_kernels(kind)
-    of_sources, of_queries = ({"of_queries": which} for which in (0, 1))
-    if max(numbers["n"], numbers["m"]) < cells_cpu.MANY:
-        return [*pages, Launch(build, numbers=of_sources)]
-    shared, rest = steps[:3], steps[3:]
-    both = [(numbers["n"], of_sources), *([] if numbers["own"] else [(numbers["m"], of_queries)])]
-    sorts = [share(step, count)._replace(numbers=which) for count, which in both for step in shared]
-    choose = [Launch(rest[0], numbers=of_sources), share(rest[1], numbers["n"])._replace(numbers=of_sources)] if rest else []
-    return [*pages, Launch(build, numbers=of_sources), *sorts, *choose]
+    n, m, sort = numbers["n"], numbers["m"], (tree_cpu if kind.rule else cells_cpu).sort_kernels(kind)
+    build = [*ask_for_huge_pages("scratch", 4 * math.prod(shapes["scratch"])), Launch(sort.build)]
+    if max(n, m) < cells_cpu.MANY:
+        return build
+    of_queries = [] if numbers["own"] else [share(step, m)._replace(numbers={"of_queries": 1}) for step in sort.steps]
+    more = [Launch(sort.more[0]), share(sort.more[1], n)] if sort.more else []
+    return [*build, *(share(step, n) for step in sort.steps), *of_queries, *more]
 
 
 def size_numbers(shapes: Shapes, own: bool) -> dict[str, int]:
-    """Return n, m, own and the cells of the table, as all kernels of cells take them."""
+    """Return n, m, own and the cells of the table, as all kernels of cells take them (of sources, unless told otherwise)."""
     n, m = shapes["positions"][0], shapes["queries"][0]
     kinds = shapes[TABLE[0]][0] if TABLE[0] in shapes else 0
-    return {"n": n, "m": m, "own": int(own), "table": table_cells(n), "kinds": kinds}
+    return {"n": n, "m": m, "own": int(own), "of_queries": 0, "table": table_cells(n), "kinds": kinds}

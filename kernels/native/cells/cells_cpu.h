@@ -136,8 +136,7 @@ struct Sort : SortArguments, Places {
             look_at_bits(queries, 0, m, lowest, highest);
         shared.unit = BOXES ? real(0) : lattice_unit(lowest, highest);
         sort_few();
-        for (int place = 0; place < n; ++place)
-            put_coordinates(positions, ids[place], place);
+        put_in_order(0, n);
     }
     // Says where cells are, for `find_keys`, and what is known before.
     void lay_out_cells() {
@@ -293,7 +292,7 @@ struct Sort : SortArguments, Places {
     }
 
     // Finds the lowest bit and the largest exponent of all coordinates, as they were given; whatever lies on no lattice shows soon.
-    void look_at_bits(const real* points, int from, int to, int& lowest, int& highest) const {
+    JFRNN_APART void look_at_bits(const real* points, int from, int to, int& lowest, int& highest) const {
         const int too_low = Bits::exponent(radius) - Bits::BIAS - UNITS;
         for (int i = from; i < to && lowest >= too_low; ++i) {
             const real* row = points + (long long)ROW * i;
@@ -315,6 +314,13 @@ struct Sort : SortArguments, Places {
         const Grid& there = BOXES ? grid_of[here].grid : grid;
         return finite_point(p) ? first_cell() + cell_key(there, p, system_of(row)) : -1;
     }
+    // Finds the keys of the points [from, to).
+    JFRNN_APART void find_keys_of(const Grid& given, const real* points, int from, int to) {
+        const Grid grid = given;  // stays in registers, whatever is stored; and so does what follows
+        int* const key = this->key;
+        for (int i = from; i < to; ++i)
+            key[i] = key_of(grid, points + (long long)ROW * i);
+    }
     // Sorts few points by cell into `order`, with the first place of each cell in `first`; points that are not finite come last. Returns
     // how many are finite.
     int sort(const Grid& grid, const real* points, int count, int* first, int* order) {
@@ -322,11 +328,10 @@ struct Sort : SortArguments, Places {
         const int cells = grid.cells;
         for (int c = 0; c < cells + 2; ++c)
             first[c] = 0;
-        for (int i = 0; i < count; ++i) {
-            key[i] = key_of(grid, points + (long long)ROW * i);
+        find_keys_of(grid, points, 0, count);
+        for (int i = 0; i < count; ++i)
             if (key[i] >= 0)
                 ++first[key[i] + 2];
-        }
         for (int c = 2; c < cells + 2; ++c)
             first[c] += first[c - 1];
         const int finite = first[cells + 1];
@@ -355,14 +360,12 @@ struct Sort : SortArguments, Places {
         const Sorted points = sorted();
         each_chunk(points.hands.finding, points.count ? points.count : 1, SORT_CHUNK, [&](int from, int to, int chunk) {
             int* const counts = this->counts + (BUCKETS + 1) * chunk;
-            const Grid grid = shared.grid;
             to = to < points.count ? to : points.count;
             for (int b = 0; b <= BUCKETS; ++b)
                 counts[b] = 0;
-            for (int i = from; i < to; ++i) {
-                key[i] = key_of(grid, points.rows + (long long)ROW * i);
+            find_keys_of(shared.grid, points.rows, from, to);
+            for (int i = from; i < to; ++i)
                 ++counts[bucket_of(key[i])];
-            }
             note_bits(points.rows, from, to);
             if (__atomic_add_fetch(&points.hands.found, 1, __ATOMIC_ACQ_REL) == chunks(points.count))
                 add_up(points);
@@ -417,13 +420,15 @@ struct Sort : SortArguments, Places {
         });
     }
     void settle() {
-        settle([&](int from, int to) {
-            for (int place = from; place < to; ++place) {
-                constexpr int AHEAD = 16;  // places: reading from anywhere is what takes time
-                __builtin_prefetch(positions + (long long)ROW * ids[place + AHEAD < to ? place + AHEAD : place]);
-                put_coordinates(positions, ids[place], place);
-            }
-        });
+        settle([&](int from, int to) { put_in_order(from, to); });
+    }
+    // Puts the coordinates of the sources at the places [from, to) there.
+    JFRNN_APART void put_in_order(int from, int to) {
+        for (int place = from; place < to; ++place) {
+            constexpr int AHEAD = 16;  // places: reading from anywhere is what takes time
+            __builtin_prefetch(positions + (long long)ROW * ids[place + AHEAD < to ? place + AHEAD : place]);
+            put_coordinates(positions, ids[place], place);
+        }
     }
     // Sorts buckets; `put` puts what is known of the sources at places [from, to) in order.
     template <class Put>

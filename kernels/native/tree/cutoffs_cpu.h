@@ -98,11 +98,10 @@ struct CutoffSort : TreeSortArguments {
     // Do queries meet few sources in the cells that they look into, beyond those that are near? As many are in the cells beside that
     // of a query as there are in its own, it is supposed.
     bool are_alike(real typical) {
-        const Grid grid = cells.shared.grid;
         const int step = m / SAMPLES + 1;
         double met = 0, near = 0;
         for (int i = 0; i < m; i += step) {
-            const int cell = cells.key_of(grid, queries + (long long)ROW * i);
+            const int cell = cells.key[i];  // of the query: sources were sorted before, if they are others
             if (cell < 0)
                 continue;
             const double there = cells.start[cell + 1] - cells.start[cell], r = reach_of(i) / (double)typical,
