@@ -50,9 +50,11 @@ def command(
     """Time each option of a search in turns with what it is compared with, which its row names.
 
     Counts of SciPy (on a CPU, with all cores) and of Warp's HashGrid stand beside ours where they answer the same question; their
-    trees and grids are built in each call. Rows say for how many pairs their counts differ from ours.
+    trees and grids are built in each call. Rows say for how many pairs their counts differ from ours. Memory that one call frees
+    serves the next one.
     """
     jax.config.update("jax_enable_x64", True)
+    _measure.keep_freed_memory()
     parts = [(option.name, functools.partial(_rows, option, points, rounds, backend)) for option in options()]
     given = [points, rounds, [name for name in PEERS.values() if methods.lacks(name) is None]]
     return table.text(table.measure(out, f"{jax.default_backend()}_{backend}", parts, given, COLUMNS), SHOWN)
