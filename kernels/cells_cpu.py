@@ -49,11 +49,11 @@ def grid_words(systems: int, width: int) -> int:
 
 
 class SortKernels(NamedTuple):
-    """What sorts: `build`; where there are many, `steps`, whose work threads share; then, if cutoffs differ, `choose`, `gather`."""
+    """What sorts: `build`; where there are many, `steps`, whose work threads share; then `more`, and whether threads share it."""
 
     build: Kernel
     steps: tuple[Kernel, ...]
-    more: tuple[Kernel, ...] = ()
+    more: tuple[tuple[Kernel, bool], ...] = ()
 
 
 @functools.lru_cache(128)

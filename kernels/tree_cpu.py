@@ -53,6 +53,8 @@ def scratch_words(sources: int, queries: int, dim: int, width: int, own: bool, s
 
 
 PROVIDER = {"places_cpu.h": '#include "cutoffs_cpu.h"\n', "query_walk_cpu.h": '#include "cutoff_walk_cpu.h"\n'}  # in place of cells
+# What is launched where many have been sorted by cell, and whether threads share its work.
+MORE = (("CutoffSort.choose", False), ("CutoffSort.refine", True), ("CutoffSort.end", False), ("TreePlaces.gather", True))
 TREE = {"LEAF": LEAF, "FANOUT": FANOUT, "CLASS_BITS": CLASS_BITS, "LEAST_TOGETHER": LEAST_TOGETHER}
 TREE |= {"MOST_TOGETHER": MOST_TOGETHER, "MOST_DOUBLED": MOST_DOUBLED, "MOST_HALVED": MOST_HALVED}
 
@@ -64,12 +66,14 @@ def _constants(kind: Kind) -> dict[str, int]:
 
 @functools.lru_cache(128)
 def sort_kernels(kind: Kind) -> cells_cpu.SortKernels:
-    """Return what sorts, as `jfrnn.kernels.cells_cpu.sort_kernels` does, and `choose` and `gather`, whose work threads share."""
+    """Return what sorts, as `jfrnn.kernels.cells_cpu.sort_kernels` does, and what goes on with a tree."""
     kind, constants = kind.only("scaled", "periodic", "batched", "rule"), _constants(kind)
-    entries, steps = ("CutoffSort.build", "CutoffSort.choose", "TreePlaces.gather"), (f"CutoffSort.{x}" for x in cells_cpu.STEPS)
-    build, *more = declare_kind(kind, "sort_tree_cpu", "cutoffs_cpu.h", *entries, constants=constants)
+    build, *more = declare_kind(
+        kind, "sort_tree_cpu", "cutoffs_cpu.h", "CutoffSort.build", *(entry for entry, _ in MORE), constants=constants
+    )
+    steps = (f"CutoffSort.{step}" for step in cells_cpu.STEPS)
     shared = declare_kind(kind, "sort_many_tree_cpu", "cutoffs_cpu.h", *steps, constants=constants)
-    return cells_cpu.SortKernels(build, tuple(shared), tuple(more))
+    return cells_cpu.SortKernels(build, tuple(shared), tuple(zip(more, (shares for _, shares in MORE), strict=True)))
 
 
 @functools.lru_cache(512)

@@ -250,7 +250,7 @@ def sort_on_cpu(kind: Kind, shapes: Shapes, numbers: Mapping[str, int]) -> list[
     if max(n, m) < cells_cpu.MANY:
         return build
     of_queries = [] if numbers["own"] else [share(step, m)._replace(numbers={"of_queries": 1}) for step in sort.steps]
-    more = [Launch(sort.more[0]), share(sort.more[1], n)] if sort.more else []
+    more = [share(step, n) if shared else Launch(step) for step, shared in sort.more]
     return [*build, *(share(step, n) for step in sort.steps), *of_queries, *more]
 
 

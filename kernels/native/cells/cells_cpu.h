@@ -26,6 +26,8 @@ struct Shared {
     int low_bit, minus_high;         // the lowest bit of all coordinates, and the largest exponent, negated
     int turned;                      // of a periodic box: 0 if all particles lie in its cell, 1 if in those beside it, else 2
     real unit;                       // of the lattice on which all coordinates lie, or 0
+    int next_refined;                // chunks of places whose cells are sorted along curves of their own
+    double corner[3], scale;         // of these cells: where the first one begins, and how many per length, 0: there are none
     real cells_for;                  // where cutoffs differ: that for which cells are wide, or 0: sources stand in a tree
 };
 
@@ -164,6 +166,7 @@ struct Sort : SortArguments, Places {
         shared.minus_high = 0;
         shared.grid = grid;
         shared.unit = 0;
+        shared.scale = 0;
         shared.bucket_bits = 0;
         while (grid.cells > BUCKETS << shared.bucket_bits)
             ++shared.bucket_bits;

@@ -63,6 +63,15 @@ struct CutoffSort : TreeSortArguments {
             tree();
     }
     JFRNN_APART void tree() { TreeSort(*this).build(); }
+    // What is left to do of many sources in a tree: `refine` is launched once per thread, `end` once.
+    void refine() {
+        if (!in_cells())
+            TreeSort(*this).refine();
+    }
+    void end() {
+        if (!in_cells() && TreeSort(*this).is_shared())
+            TreeSort(*this).end();
+    }
     // Returns whether sources stand in cells, as far as is known, and lets them be as wide as was said.
     bool in_cells() {
         const real width = cells.shared.cells_for;

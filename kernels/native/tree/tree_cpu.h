@@ -153,9 +153,15 @@ struct TreeSort : TreePlaces {
 
     explicit TreeSort(const TreeSortArguments& given) : TreePlaces(given) {}
 
+    // Sorts sources and queries; of many sources that are queries, too, those that share a cell are left to `refine` and `end`.
     void build() {
         const int finite = sort(positions, n, ids);
         shared.grid.finite = finite;
+        if (!is_shared())
+            end();
+    }
+    void end() {
+        const int finite = shared.grid.finite;
         if (own) {
             for (int k = 0; k < n; ++k)
                 query_ids[k] = ids[k];
@@ -168,6 +174,29 @@ struct TreeSort : TreePlaces {
             put_in_order(0, n);
             make_leaves(0, n);
             make_nodes();
+        }
+    }
+
+    bool is_shared() const { return own && n >= MANY; }
+    // Sorts those that share a cell, by several threads.
+    void refine() {
+        const int* const begins = counts;
+        if (is_shared() && shared.scale > 0)
+            each_chunk(shared.next_refined, n, CHUNK, [&](int, int, int chunk) {
+                arrange_cells(positions, ids, begins[chunk], begins[chunk + 1], shared.corner, shared.scale);
+            });
+    }
+    // Says with which cell each chunk of `refine` begins.
+    void share(int finite, const double* corner, double scale) {
+        for (int k = 0; k < DIM; ++k)
+            shared.corner[k] = corner[k];
+        shared.scale = scale;
+        shared.next_refined = 0;
+        for (int chunk = 0, place = 0; chunk <= (n - 1) / CHUNK + 1; ++chunk) {
+            place = place > chunk * CHUNK ? place : chunk * CHUNK < finite ? chunk * CHUNK : finite;
+            while (place > 0 && place < finite && key[place] == key[place - 1] && same_system(positions, ids, place - 1, place))
+                ++place;
+            counts[chunk] = place;
         }
     }
 
@@ -234,7 +263,15 @@ struct TreeSort : TreePlaces {
         sort_by_key(at, from, to);
         if (BATCHED && first)
             sort_by_system(points, at, from, to);
-        for (int begin = from, end; begin < to; begin = end) {  // those that share a cell
+        if (first && is_shared())
+            share(to, corner, scale);
+        else
+            arrange_cells(points, at, from, to, corner, scale);
+    }
+    // Sorts the points [from, to) of `at` that share a cell; `key` tells which do.
+    JFRNN_APART void arrange_cells(const real* points, int* at, int from, int to, const double* corner, double scale) {
+        const unsigned int* const keys = (const unsigned int*)key;
+        for (int begin = from, end; begin < to; begin = end) {
             for (end = begin + 1; end < to && keys[end] == keys[begin] && same_system(points, at, begin, end);)
                 ++end;
             if (end - begin > 2 * LEAF)
