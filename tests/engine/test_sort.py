@@ -49,7 +49,7 @@ def find_rows():
 
 def write_rows(file):
     cells_cpu.MANY = cells_cpu.CHUNKS["MANY"] = 1
-    cells_cpu.CHUNKS["SORT_CHUNK"] = cells_cpu.SORT_CHUNK = 16
+    cells_cpu.CHUNKS["SORT_CHUNK"] = cells_cpu.CHUNKS["CHUNK"] = cells_cpu.SORT_CHUNK = 16
     np.savez(file, **find_rows())
 
 
