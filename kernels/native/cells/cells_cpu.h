@@ -168,7 +168,7 @@ struct Sort : SortArguments, Places {
         shared.unit = 0;
         shared.scale = 0;
         shared.bucket_bits = 0;
-        while (grid.cells > BUCKETS << shared.bucket_bits)
+        while (grid.cells > (long long)BUCKETS << shared.bucket_bits)
             ++shared.bucket_bits;
     }
     // Sorts sources and queries, where there are few.
