@@ -99,6 +99,7 @@ _KINDS: dict[str, Callable[[np.random.Generator, int], dict[str, Any]]] = {
     "float64": lambda _, n: {},
     "as many queries": lambda random, n: {"queries": jnp.asarray(random.random((n, 3)), jnp.float32)},
     "a tenth inactive": lambda random, n: {"active": jnp.asarray(random.random(n) < 0.9)},
+    "a tenth active": lambda random, n: {"active": jnp.asarray(random.random(n) < 0.1)},
     "skin of a tenth": lambda _, n: {"skin": 0.1 * _radius(n)},
     "list with reverse slots": lambda _, n: {"reverse": True},
     "flat list of edges": lambda _, n: {"flat": True},
@@ -107,8 +108,16 @@ _KINDS: dict[str, Callable[[np.random.Generator, int], dict[str, Any]]] = {
     "box, periodic along x": lambda _, n: {"box": jfrnn.Box([1.0, 1.0, 1.0], (True, False, False))},
     "box, skewed": lambda _, n: {"box": jfrnn.Box(np.eye(3) + np.diag([0.3, 0.3], 1))},
     "box, images told apart": lambda _, n: {"box": jfrnn.Box([1.0, 1.0, 1.0], images=1)},
-    "batch of 100 systems, superposed": lambda random, n: {"batch": jnp.asarray(random.integers(0, _SYSTEMS, n), jnp.int32)},
+    "batch of 100 systems, superposed": lambda random, n: {"batch": _systems(random, n)},
+    "batch of 100 systems, a box for each": lambda random, n: {
+        "batch": _systems(random, n),
+        "box": jfrnn.Box(np.tile(np.eye(3), (_SYSTEMS, 1, 1))),
+    },
 }
+
+
+def _systems(random: np.random.Generator, n: int) -> jax.Array:
+    return jnp.asarray(random.integers(0, _SYSTEMS, n), jnp.int32)
 
 
 def _with(name: str, n: int) -> Asked:
