@@ -149,7 +149,7 @@ from experiments._measure import PeakMemory
 backend, n, separation = sys.argv[1], int(sys.argv[2]), float(sys.argv[3])
 blobs = scene("two-blobs", n=n, separation=separation)
 x, search = jax.numpy.asarray(blobs.positions), jax.jit(lambda x: jfrnn.search(x, blobs.cutoff, capacity=8, backend=backend))
-jax.block_until_ready(search(x[:10]))
+jax.block_until_ready(search(x[: 1 << 15]))  # so many that kernels are compiled which sort many
 compiled = search.lower(x).compile()
 memory = PeakMemory()
 found = jax.block_until_ready(compiled(x))
@@ -229,7 +229,7 @@ def with_gradient(x, m):
 
 x, m = jax.numpy.asarray(random.random((n, 3)), "float32"), jax.numpy.ones(n, "float32")
 program = jax.jit(with_gradient if gradient else run)
-jax.block_until_ready(program(x[:10], m[:10]))
+jax.block_until_ready(program(x[: 1 << 15], m[: 1 << 15]))  # as above
 compiled = program.lower(x, m).compile()
 memory = PeakMemory()
 jax.block_until_ready(compiled(x, m))
