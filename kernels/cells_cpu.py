@@ -26,21 +26,17 @@ CHUNKS = {"CHUNK": CHUNK, "QUERY_CHUNK": QUERY_CHUNK, "MANY": MANY, "SORT_CHUNK"
 
 
 def scratch_words(sources: int, queries: int, dim: int, width: int, own: bool, systems: int = 0) -> int:
-    """Return the int32 words of scratch that `build` and `query` need.
+    """Return the int32 words of scratch that a sort and queries need.
 
     `width` is 1 for float32 and 2 for float64; `systems` is how many there are with boxes of their own.
     """
     table = table_cells(sources) + ENTRIES * systems
     most = max(sources, queries)
-    parts = [_HEADER_WORDS, *[width * sources] * dim, sources, table + 2, most, count_words(most)]
+    parts = [_HEADER_WORDS, *[width * sources] * dim, sources, table + 2, most]
+    parts += [(BUCKETS + 1) * -(-most // SORT_CHUNK)] * (most >= MANY)  # how many each chunk has for each bucket
     if not own:
         parts += [queries, table + 2, most, most]
     return place_parts(parts)
-
-
-def count_words(most: int) -> int:
-    """Return the int32 words for what is counted while so many sources, or queries, are sorted."""
-    return 0 if most < MANY else (BUCKETS + 1) * -(-most // SORT_CHUNK)
 
 
 def grid_words(systems: int, width: int) -> int:
@@ -49,7 +45,7 @@ def grid_words(systems: int, width: int) -> int:
 
 
 class SortKernels(NamedTuple):
-    """What sorts: `build`; where there are many, `steps`, whose work threads share; then `more`, and whether threads share it."""
+    """What sorts: `build`; where there are many, `steps`, whose work threads share; then `more`, and whether threads share each."""
 
     build: Kernel
     steps: tuple[Kernel, ...]

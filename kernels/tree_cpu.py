@@ -12,7 +12,7 @@ import functools
 import itertools
 
 from jfrnn.kernels import cells_cpu
-from jfrnn.kernels._native import Kind, declare_kind, place_parts, table_cells
+from jfrnn.kernels._native import Kind, declare_kind, place_parts
 from jfrnn.kernels._program import Kernel
 
 LEAF = 16  # sources of a leaf
@@ -25,36 +25,23 @@ _MOST_LANES = 16
 
 
 def scratch_words(sources: int, queries: int, dim: int, width: int, own: bool, systems: int = 0) -> int:
-    """Return the int32 words of scratch that `build` and queries need, as `jfrnn.kernels.cells_cpu.scratch_words` does."""
+    """Return the int32 words of scratch that a sort and queries need, as `jfrnn.kernels.cells_cpu.scratch_words` does."""
     del own  # queries have an order of their own, by their cutoffs
+    cells = cells_cpu.scratch_words(sources, queries, dim, width, own=False, systems=systems)
     nodes, count = 0, -(-sources // LEAF)
     for _ in itertools.repeat(None, 12):
         nodes += -(-count // FANOUT) * FANOUT
         if count <= FANOUT:
             break
         count = -(-count // FANOUT)
-    most = max(sources, queries)
-    table = table_cells(sources) + cells_cpu.ENTRIES * systems + 2
-    parts = [
-        64,
-        *[width * sources] * dim,
-        sources,
-        table,
-        most,
-        cells_cpu.count_words(most),
-        queries,
-        table,
-        most,
-        most,
-    ]  # of cells
-    parts += [width * (sources + _MOST_LANES), sources + _MOST_LANES, sources, width * queries]
+    parts = [width * (sources + _MOST_LANES), sources + _MOST_LANES, sources, width * queries]
     parts += [width * (nodes + _MOST_LANES)] * (2 * dim + 1)
-    return place_parts(parts)
+    return cells + place_parts(parts)
 
 
 PROVIDER = {"places_cpu.h": '#include "cutoffs_cpu.h"\n', "query_walk_cpu.h": '#include "cutoff_walk_cpu.h"\n'}  # in place of cells
-# What is launched where many have been sorted by cell, and whether threads share its work.
-MORE = (("CutoffSort.choose", False), ("CutoffSort.refine", True), ("CutoffSort.end", False), ("TreePlaces.gather", True))
+# What is launched of many after the steps of a sort by cell, and whether threads share its work.
+MORE = {"CutoffSort.choose": False, "CutoffSort.refine": True, "CutoffSort.end": False, "TreePlaces.gather": True}
 TREE = {"LEAF": LEAF, "FANOUT": FANOUT, "CLASS_BITS": CLASS_BITS, "LEAST_TOGETHER": LEAST_TOGETHER}
 TREE |= {"MOST_TOGETHER": MOST_TOGETHER, "MOST_DOUBLED": MOST_DOUBLED, "MOST_HALVED": MOST_HALVED}
 
@@ -68,12 +55,10 @@ def _constants(kind: Kind) -> dict[str, int]:
 def sort_kernels(kind: Kind) -> cells_cpu.SortKernels:
     """Return what sorts, as `jfrnn.kernels.cells_cpu.sort_kernels` does, and what goes on with a tree."""
     kind, constants = kind.only("scaled", "periodic", "batched", "rule"), _constants(kind)
-    build, *more = declare_kind(
-        kind, "sort_tree_cpu", "cutoffs_cpu.h", "CutoffSort.build", *(entry for entry, _ in MORE), constants=constants
-    )
-    steps = (f"CutoffSort.{step}" for step in cells_cpu.STEPS)
-    shared = declare_kind(kind, "sort_many_tree_cpu", "cutoffs_cpu.h", *steps, constants=constants)
-    return cells_cpu.SortKernels(build, tuple(shared), tuple(zip(more, (shares for _, shares in MORE), strict=True)))
+    build, *more = declare_kind(kind, "sort_tree_cpu", "cutoffs_cpu.h", "CutoffSort.build", *MORE, constants=constants)
+    names = (f"CutoffSort.{step}" for step in cells_cpu.STEPS)
+    steps = declare_kind(kind, "sort_many_tree_cpu", "cutoffs_cpu.h", *names, constants=constants)
+    return cells_cpu.SortKernels(build, tuple(steps), tuple(zip(more, MORE.values(), strict=True)))
 
 
 @functools.lru_cache(512)

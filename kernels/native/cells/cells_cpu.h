@@ -11,7 +11,7 @@ constexpr int BUCKETS = 256;        // of cells, as in jfrnn/kernels/cells_cpu.p
 constexpr int SAMPLED = 256;        // cutoffs, and coordinates, that tell what is typical
 constexpr int MOST_OUTSIDE = 4096;  // sources outside of the box of cells, where a box of all would be too large
 
-// Parts that threads have taken of each step of a sort, and how many particles have found their cells.
+// Parts that threads have taken of each step of a sort, and how many chunks of particles have found their cells.
 struct Hands {
     int finding, dealing, settling, found;
 };
@@ -20,7 +20,7 @@ struct Shared {
     int finite_queries;
     int next_chunk;
     int next_gathered, next_sorted;  // chunks of sources that are put in order, and of their values
-    int gathered;                    // sources that are
+    int gathered;                    // sources that have been
     Hands hands[2];                  // for sources, and for queries
     int bucket_bits;                 // of a cell's number, below those of its bucket's
     int low_bit, minus_high;         // the lowest bit of all coordinates, and the largest exponent, negated
@@ -129,18 +129,16 @@ struct Sort : SortArguments, Places {
 
     void build() {
         lay_out_cells();
-        *bits = 0;
         if (many())
             return;
-        int lowest = 1 << 20, highest = 0;
-        look_at_bits(positions, 0, n, lowest, highest);
+        note_bits(positions, 0, n);
         if (!own)
-            look_at_bits(queries, 0, m, lowest, highest);
-        shared.unit = BOXES ? real(0) : lattice_unit(lowest, highest);
+            note_bits(queries, 0, m);
+        find_unit();
         sort_few();
         put_in_order(0, n);
     }
-    // Says where cells are, for `find_keys`, and what is known before.
+    // Says where cells are.
     void lay_out_cells() {
         Grid grid;
         if constexpr (BOXES)
@@ -155,11 +153,13 @@ struct Sort : SortArguments, Places {
                 leave_out_few(grid, low, high);
         }
         begin(grid);
+    }
+    // Writes what is known before a sort, and zeros to what is counted.
+    void begin(const Grid& grid) {
+        *bits = 0;
         if (longest)  // of a sum there is none
             *longest = 0;
         note_turns();
-    }
-    void begin(const Grid& grid) {
         shared.next_chunk = shared.next_gathered = shared.next_sorted = shared.gathered = 0;
         shared.hands[0] = shared.hands[1] = Hands{};
         shared.low_bit = 1 << 20;
@@ -294,8 +294,10 @@ struct Sort : SortArguments, Places {
         }
     }
 
-    // Finds the lowest bit and the largest exponent of all coordinates, as they were given; whatever lies on no lattice shows soon.
-    JFRNN_APART void look_at_bits(const real* points, int from, int to, int& lowest, int& highest) const {
+    // Notes the lowest bit and the largest exponent of the coordinates of [from, to), as they were given. Whatever lies on no lattice
+    // shows soon: then no more are looked at, by any thread.
+    JFRNN_APART void note_bits(const real* points, int from, int to) {
+        int lowest = __atomic_load_n(&shared.low_bit, __ATOMIC_RELAXED), highest = 0;
         const int too_low = Bits::exponent(radius) - Bits::BIAS - UNITS;
         for (int i = from; i < to && lowest >= too_low; ++i) {
             const real* row = points + (long long)ROW * i;
@@ -307,7 +309,14 @@ struct Sort : SortArguments, Places {
                 highest = exponent > highest ? exponent : highest;
             }
         }
+        lower(shared.low_bit, lowest);
+        lower(shared.minus_high, -highest);
     }
+    static void lower(int& least, int value) {
+        int there = __atomic_load_n(&least, __ATOMIC_RELAXED);
+        while (value < there && !__atomic_compare_exchange_n(&least, &there, value, true, __ATOMIC_RELAXED, __ATOMIC_RELAXED)) {}
+    }
+    void find_unit() { shared.unit = BOXES ? real(0) : lattice_unit(shared.low_bit, -shared.minus_high); }
 
     // The cell of a point, -1 if it is not finite.
     int key_of(const Grid& grid, const real* row) {
@@ -319,7 +328,7 @@ struct Sort : SortArguments, Places {
     }
     // Finds the keys of the points [from, to).
     JFRNN_APART void find_keys_of(const Grid& given, const real* points, int from, int to) {
-        const Grid grid = given;  // stays in registers, whatever is stored; and so does what follows
+        const Grid grid = given;  // stays in registers, whatever is stored, and so does `key`
         int* const key = this->key;
         for (int i = from; i < to; ++i)
             key[i] = key_of(grid, points + (long long)ROW * i);
@@ -361,7 +370,8 @@ struct Sort : SortArguments, Places {
 
     void find_keys() {
         const Sorted points = sorted();
-        each_chunk(points.hands.finding, points.count ? points.count : 1, SORT_CHUNK, [&](int from, int to, int chunk) {
+        const int count = points.count ? points.count : 1;  // where there are no points, an empty chunk is counted, too
+        each_chunk(points.hands.finding, count, SORT_CHUNK, [&](int from, int to, int chunk) {
             int* const counts = this->counts + (BUCKETS + 1) * chunk;
             to = to < points.count ? to : points.count;
             for (int b = 0; b <= BUCKETS; ++b)
@@ -374,17 +384,7 @@ struct Sort : SortArguments, Places {
                 add_up(points);
         });
     }
-    void note_bits(const real* rows, int from, int to) {
-        int lowest = __atomic_load_n(&shared.low_bit, __ATOMIC_RELAXED), highest = 0;
-        look_at_bits(rows, from, to, lowest, highest);
-        lower(shared.low_bit, lowest);
-        lower(shared.minus_high, -highest);
-    }
-    static void lower(int& least, int value) {
-        int there = __atomic_load_n(&least, __ATOMIC_RELAXED);
-        while (value < there && !__atomic_compare_exchange_n(&least, &there, value, true, __ATOMIC_RELAXED, __ATOMIC_RELAXED)) {}
-    }
-    // Finds where the first point goes that each chunk has for each bucket.
+    // Finds where the first point goes that each chunk has for each bucket, and what is known once all have been looked at.
     void add_up(const Sorted& points) {
         int next[BUCKETS + 1] = {}, *const end = counts + (BUCKETS + 1) * chunks(points.count);
         for (int* of = counts; of < end; of += BUCKETS + 1)
@@ -409,7 +409,7 @@ struct Sort : SortArguments, Places {
             shared.finite_queries = finite;
         if (finite < points.count)
             *bits = 2;
-        shared.unit = BOXES ? real(0) : lattice_unit(shared.low_bit, -shared.minus_high);
+        find_unit();
     }
     void deal() {
         const Sorted points = sorted();

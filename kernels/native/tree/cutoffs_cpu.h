@@ -16,19 +16,13 @@ struct CutoffSort : TreeSortArguments {
     explicit CutoffSort(const TreeSortArguments& given) : TreeSortArguments(given), cells(given) {}
 
     void build() {
-        Shared& shared = cells.shared;
-        *bits = 0;
         if constexpr (BOXES) {  // by cells that are wide enough for the largest cutoff of each system
             cells.lay_out_cells();
-            shared.cells_for = 1;
+            cells.shared.cells_for = 1;
         } else {
             Grid grid;
-            const real width = lay_out(grid);
+            cells.shared.cells_for = lay_out(grid);
             cells.begin(grid);
-            cells.note_turns();
-            shared.cells_for = width;
-            if (longest)
-                *longest = 0;
         }
         if (cells.many())
             return;
@@ -63,7 +57,7 @@ struct CutoffSort : TreeSortArguments {
             tree();
     }
     JFRNN_APART void tree() { TreeSort(*this).build(); }
-    // What is left to do of many sources in a tree: `refine` is launched once per thread, `end` once.
+    // What is left to do where many sources, which are the queries, stand in a tree: `refine` is launched once per thread, `end` once.
     void refine() {
         if (!in_cells())
             TreeSort(*this).refine();

@@ -147,7 +147,7 @@ struct TreePlaces : TreeSortArguments, SystemCells, TreeScratch {
     }
 };
 
-// One thread, which reads every particle a few times.
+// Sorts along curves. One thread reads every particle a few times; `refine` alone has several.
 struct TreeSort : TreePlaces {
     int histogram[DIGITS];
 
