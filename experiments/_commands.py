@@ -13,7 +13,7 @@ from typing import Annotated, Any, ClassVar
 import typer
 from typer.core import TyperGroup
 
-from experiments._errors import UsageError
+from experiments._errors import NoResultError, UsageError
 
 MOST_POINTS = 100_000_000
 MOST_SEED = 2**31 - 1
@@ -81,14 +81,14 @@ def _report_error(error: Exception, given: Sequence[str]) -> int:
     if isinstance(error, typer.Abort):
         typer.echo("aborted", err=True)
         return 1
-    if isinstance(error, UsageError | OSError | MemoryError):
+    if isinstance(error, UsageError | NoResultError | OSError | MemoryError):
         said = str(error)
         if isinstance(error, OSError):
             said = (f"{error.filename}: " if error.filename else "") + (error.strerror or said)
         elif isinstance(error, MemoryError):
             said = f"this takes more memory than there is; ask for fewer particles: {said}"
         typer.echo(f"error: {said}", err=True)
-        return 2
+        return 1 if isinstance(error, NoResultError) else 2
     tell, context = getattr(error, "format_message", None), getattr(error, "ctx", None)
     if tell is None:
         raise error

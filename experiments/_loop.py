@@ -9,6 +9,7 @@ from typing import Any, Generic
 from tqdm import tqdm
 
 from experiments import _machine
+from experiments._errors import NoResultError
 from experiments._rows import RETRIED, RowFile, RowT
 
 
@@ -90,6 +91,19 @@ def _measure(
         if (line := describe(stamped)) is not None:
             shown.say(line)
     shown.update(len(task.keys))
+
+
+def with_result(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return the rows of a table, whose status is "ok" or not told where they have a result.
+
+    Raises:
+        NoResultError: there are rows, and none has one.
+    """
+    outcomes = [(row.get("status"), row.get("reason")) for row in rows]
+    if rows and all(status not in (None, "ok") for status, _ in outcomes):
+        why = dict.fromkeys(": ".join(filter(None, outcome)) for outcome in outcomes)
+        raise NoResultError(f"none of {len(rows)} rows has a result ({'; '.join(why)})")
+    return rows
 
 
 def in_parts(key: str, rows: Iterable[dict[str, Any]]) -> Iterator[dict[str, Any]]:

@@ -251,14 +251,14 @@ def _serve(name: str, pipe: Connection) -> None:
         try:
             given = problem(case, _DTYPE, _DIM)
             if given.batch is not None and name != "jfrnn":
-                answer = {"answer": "not asked"}
+                answer = {"answer": "not asked", "status": "skipped"}
             else:
                 i, j = PEERS[name].ask(given)
                 answer = _judge(Counter(zip(i.tolist(), j.tolist(), strict=True)), case)
         except Cannot as error:
             answer = {"answer": f"no {error}"}
         except ImportError:
-            answer = {"answer": "not installed"}
+            answer = {"answer": "not installed", "status": "missing", "reason": f"{name} is not installed"}
         except Exception as error:  # what a peer raises is its answer
             reason = " ".join(str(error).split())[:200]
             answer = {"answer": "out of memory" if "out of memory" in reason.lower() else "error", "reason": reason}

@@ -17,7 +17,7 @@ from experiments import _sweep
 from experiments._commands import RetryFailed, RowsFolder, take_folder
 from experiments._config import Dtype, LayoutName, Positive, Repeats, Seed, digest, load, one_of
 from experiments._look import MARKERS, OURS, PEERS_COLORS, WIDTH, dress, factor, head, plain, write_names
-from experiments._loop import Shown, Task, fill
+from experiments._loop import Shown, Task, fill, with_result
 from experiments._rows import RowFile
 from experiments.bench.ways import WAYS
 
@@ -74,9 +74,12 @@ def run(config: Config, folder: Path, retry_failed: bool = False) -> list[_Line]
     Times are of list and sums, `build_s` of the list and `sum_s` of the sums alone [s]; `peak_bytes` is the peak of the memory over
     the start of a run. `error` is the largest error against float64 over the sum of |terms|, in eps·sqrt(number of neighbors),
     rounding of the terms included.
+
+    Raises:
+        NoResultError: none of these rows has a result.
     """
     tasks = [Task((digest(x),), f"{x['layout']} {x['spacing']:g} m · {x['way']}", partial(_measure, x)) for x in config.specs()]
-    return fill(RowFile(folder, dict), tasks, describe, retry_failed=retry_failed)
+    return with_result(fill(RowFile(folder, dict), tasks, describe, retry_failed=retry_failed))
 
 
 def _measure(spec: _Line, shown: Shown) -> list[_Line]:

@@ -9,7 +9,7 @@ import pandas as pd
 from experiments import _machine, methods
 from experiments._commands import take_folder
 from experiments._config import digest
-from experiments._loop import Task, fill, in_parts
+from experiments._loop import Task, fill, in_parts, with_result
 from experiments._rows import RowFile
 
 Line = dict[str, Any]
@@ -102,6 +102,9 @@ def fill_parts(
     What is `given` decides what is measured, too: with another value, all is. `about` is what else rows say of where they were
     measured, and `describe` makes a line of a row for the reader. With `retry_failed`, parts whose last row is of something missing
     or failed are measured again.
+
+    Raises:
+        NoResultError: none of these rows has a result.
     """
     import jax
 
@@ -110,7 +113,7 @@ def fill_parts(
         key = digest([label, given])
         tasks.append(Task((key,), label, lambda _, key=key, rows=rows: in_parts(key, rows())))
     about |= {"device": jax.devices()[0].device_kind}
-    return fill(RowFile(take_folder(folder), dict), tasks, describe, about=about, retry_failed=retry_failed)
+    return with_result(fill(RowFile(take_folder(folder), dict), tasks, describe, about=about, retry_failed=retry_failed))
 
 
 def measure(folder: Path, name: str, parts: Iterable[Part], given: object, columns: Sequence[str]) -> pd.DataFrame:

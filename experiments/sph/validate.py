@@ -16,7 +16,7 @@ from matplotlib.figure import Figure as Picture
 from experiments import _machine
 from experiments._commands import check_names, take_folder
 from experiments._look import MARKERS, OURS, PEER, make_axes, write_names
-from experiments._loop import Task, fill
+from experiments._loop import Task, fill, with_result
 from experiments._rows import RowFile
 from experiments.sph.validation import CASES, Case, Curves, Seen, look
 from jfrnn.sph import health, solver
@@ -34,7 +34,7 @@ def command(
     jax.config.update("jax_enable_x64", True)
     check_names("case", cases, CASES)
     tasks = [Task((name,), name, partial(_rows, name)) for name in cases or CASES]
-    rows = fill(RowFile(take_folder(out), dict), tasks, _in_words, about={"versions": _machine.versions()})
+    rows = with_result(fill(RowFile(take_folder(out), dict), tasks, _in_words, about={"versions": _machine.versions()}))
     return report(rows, out)
 
 

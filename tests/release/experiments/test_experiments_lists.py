@@ -4,7 +4,7 @@ import jax
 import numpy as np
 import pandas as pd
 import pytest
-from commanded import told
+from commanded import invoke, told
 
 from experiments import methods
 from experiments.bench import arrays, crystals, latency, lists, structures, table, triangles
@@ -131,3 +131,14 @@ def test_libraries_that_find_nearest_triangles_agree(tmp_path):
     peers = rows[rows["method"].isin(["trimesh", "libigl", "wp.Mesh nearest"])]
     assert not peers[["missing", "extra"]].to_numpy().any()
     assert "us_per_particle" in text
+
+
+def test_a_bench_of_which_no_row_has_a_result_ends_with_status_1(tmp_path, monkeypatch):
+    ways = [each._replace(method="a-peer") for each in crystals._ways()]
+    monkeypatch.setattr(crystals, "_ways", lambda: iter(ways))
+    monkeypatch.setattr(methods, "lacks", lambda name: f"no module named {name!r}")
+    words = ("bench", "crystals", "--sizes", "2x5", "--repeats", 2, "--out", tmp_path)
+    for _ in range(2):  # measured, and there already
+        code, out, err = invoke(*words)
+        assert (code, out) == (1, "")
+        assert err.endswith(f"\nerror: none of {len(ways)} rows has a result (missing: no module named 'a-peer')\n")
