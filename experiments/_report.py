@@ -28,17 +28,23 @@ ABSENT = "·"
 
 
 def kind_of(folder: Path) -> tuple[Any, str | None]:
-    """Return the kind of the rows of a folder, and the module of their report; None for a sweep, and where the first is no row."""
+    """Return the kind of the rows of a folder, and the module of their report.
+
+    There is no module for a sweep, where the first is no row, and for rows of a bench that prints its table itself.
+    """
     try:
         columns = set(dict(json.loads(read_text(folder / "rows.jsonl").partition("\n")[0])))
     except (OSError, TypeError, ValueError):
         columns = set()
-    return next(((dict, module) for known, module in _KINDS if known <= columns), (SearchRow, None))
+    other = (dict if "key" in columns and "fill_asked" not in columns else SearchRow), None
+    return next(((dict, module) for known, module in _KINDS if known <= columns), other)
 
 
 def report(folder: Path) -> None:
     """Print the tables of a folder, and write them and pictures beside the rows."""
     kind, module = kind_of(folder)
+    if kind is dict and module is None:
+        raise UsageError(f"{folder}: rows of a bench, whose own command prints their table: give it again, with --out {folder}")
     if module is None:
         report_sweep(folder)
     else:

@@ -277,6 +277,13 @@ def test_a_folder_without_rows(tmp_path):
     assert refused("report", tmp_path).startswith(f"{tmp_path}: no rows; fill it with `python -m experiments run CONFIG.toml --out")
 
 
+def test_rows_of_a_bench_that_prints_its_own_table_are_no_broken_rows(tmp_path):
+    RowFile(tmp_path, dict).append({"key": "a", "who": "jfrnn", "what": "list", "status": "ok"})
+    assert refused("report", tmp_path) == (
+        f"{tmp_path}: rows of a bench, whose own command prints their table: give it again, with --out {tmp_path}"
+    )
+
+
 def test_without_memory_there_are_no_pictures_of_it(tmp_path, monkeypatch):
     monkeypatch.setattr(_plots.Figure, "savefig", lambda figure, path, dpi: path.touch())
     file = RowFile(tmp_path)
