@@ -23,9 +23,9 @@ def draw(scene: Scene, there: np.ndarray, x: np.ndarray, v: np.ndarray, time: fl
     The frame is the bounds of the scene, and the color scale ends at `top_speed` [m/s].
     """
     x, aslant = view.wrap_positions(scene, x), scene.solid is not None and scene.dim == 3
-    lower, upper = picture_bounds(scene)
+    lower, upper = view.picture_bounds(scene)
     wide, high = (upper - lower)[[0, -1]]
-    tall = 6.0 if aslant else min(max(7.0 * high / max(wide, 1e-300), 2.5) + 0.8, 9.0)
+    tall = 6.0 if aslant else min(max(7.0 * high / wide, 2.5) + 0.8, 9.0)
     figure = Figure(figsize=(7.0, tall), layout="constrained")
     axes, scale = figure.add_subplot(), ScalarMappable(Normalize(0, top_speed or 1.0), "viridis")
     if aslant:
@@ -47,8 +47,8 @@ def _draw_from_side(
     wall = np.zeros(scene.n, bool) if scene.wall is None else scene.wall
     depth = np.argsort(x[:, 1]) if scene.dim == 3 else np.arange(scene.n)
     seen = depth[(there & ~wall)[depth]]
-    lower, upper = picture_bounds(scene)
-    pixels = 72 * 6.0 * scene.spacing / max(upper[0] - lower[0], 1e-300)
+    lower, upper = view.picture_bounds(scene)
+    pixels = 72 * 6.0 * scene.spacing / (upper[0] - lower[0])
     shape = {"s": max(0.8 * pixels, 0.6) ** 2, "linewidths": 0}
     axes.scatter(*x[wall][:, [0, -1]].T, color=WALL, **shape)
     if scene.solid is not None:
@@ -56,13 +56,6 @@ def _draw_from_side(
         axes.add_collection(LineCollection(list(vertices[scene.solid.faces])))
     axes.scatter(*x[seen][:, [0, -1]].T, color=scale.to_rgba(np.linalg.norm(v[seen], axis=1)), **shape)
     axes.set(xlabel="x [m]", ylabel=f"{'xyz'[scene.dim - 1]} [m]")
-
-
-def picture_bounds(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
-    """Return the lower and upper corner of what is shown."""
-    if scene.bounds is None:
-        return scene.positions.min(axis=0), scene.positions.max(axis=0)
-    return np.array(scene.bounds.lower), np.array(scene.bounds.upper)
 
 
 def animate(folder: Path, path: Path, seconds: float = 0.08) -> Path | None:

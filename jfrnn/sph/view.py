@@ -50,6 +50,13 @@ def wrap_positions(scene: Scene, x: np.ndarray) -> np.ndarray:
     return np.where(scene.periodic.axes, x - np.floor((x - lower) / lengths) * lengths, x)
 
 
+def picture_bounds(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+    """Return the lower and upper corner of what is shown: where a scene does not say, of its particles, which have a width."""
+    if scene.bounds is None:
+        return scene.positions.min(axis=0) - scene.spacing / 2, scene.positions.max(axis=0) + scene.spacing / 2
+    return np.array(scene.bounds.lower), np.array(scene.bounds.upper)
+
+
 def turn_vertices(vertices: np.ndarray, turning: Turning[float, tuple[float, ...]] | None, time: float) -> np.ndarray:
     """Return the corners of a solid [v, d] at a time [s]."""
     if turning is None:
@@ -64,10 +71,9 @@ def turn_vertices(vertices: np.ndarray, turning: Turning[float, tuple[float, ...
 
 
 def _canvas(scene: Scene) -> _Canvas:
-    bounds = np.stack([scene.positions.min(axis=0), scene.positions.max(axis=0)])
-    if scene.bounds is not None:
-        bounds = np.array([scene.bounds.lower, scene.bounds.upper])
-    corners = np.stack(np.meshgrid(*bounds.T, indexing="ij"), axis=-1).reshape(-1, 3) @ np.stack([_RIGHT, _UP], axis=1)
+    corners = np.stack(np.meshgrid(*np.transpose(picture_bounds(scene)), indexing="ij"), axis=-1).reshape(-1, 3) @ np.stack(
+        [_RIGHT, _UP], axis=1
+    )
     low, extent = corners.min(axis=0), np.ptp(corners, axis=0)
     scale = PIXELS / extent.max()
     wide, high = np.ceil(extent * scale).astype(int)

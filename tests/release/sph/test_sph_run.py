@@ -7,8 +7,10 @@ import re
 import signal
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import pyvista
@@ -19,7 +21,7 @@ from test_sph_commands import read_table, refused
 
 from jfrnn._triangles.winding import is_closed
 from jfrnn.cases import fluids, meshes
-from jfrnn.sph import health, runs
+from jfrnn.sph import frames, health, runs
 from jfrnn.sph.files import read_solid, with_solid
 from jfrnn.sph.model import make_model, make_state
 from jfrnn.sph.settings import make_scene
@@ -246,3 +248,14 @@ def test_meshes_are_read(tmp_path, kind):
     assert (points.shape, named.shape, named.dtype) == (vertices.shape, faces.shape, np.int32)
     found, given = (np.sort(corners.reshape(len(faces), -1), axis=0) for corners in (points[named], vertices[faces]))
     assert np.allclose(found, given, atol=1e-6)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_particles_in_one_line_that_name_no_bounds_are_drawn(tmp_path, dim):
+    """Such as those of a nozzle in 2D; in 3D one particle beside a solid, which is seen aslant."""
+    scene, column = make_scene("block", []), np.array([[0.2, 0.4], [0.2, 0.6]])
+    if dim == 3:
+        scene, column = replace(scene, spacing=0.1, solid=fluids.Solid(*meshes.cube(0.5, 1))), np.array([[0.2, 0.2, 0.4]])
+    scene, there = replace(scene, positions=column, bounds=None), np.ones(len(column), bool)
+    frames.draw(scene, there, column, 0 * column, 0.0, 1.0, tmp_path / "frame.png")
+    assert plt.imread(tmp_path / "frame.png")[..., :3].std() > 0.05
