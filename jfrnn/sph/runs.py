@@ -76,8 +76,9 @@ def run(
 ) -> State:
     """Run a scene from its beginning, or from the last snapshot of the folder, to its end.
 
-    Ctrl-C stops it between two steps; the same call then goes on from the last snapshot, to the same end. A run that has ended goes
-    on if the scene takes longer, and has as many snapshots more.
+    Ctrl-C stops it between two steps; the same call then goes on from the last snapshot, to the same end: bit by bit, or within
+    rounding where sums are over a list, which is made anew. A run that has ended goes on if the scene takes longer, and has as many
+    snapshots more.
 
     Args:
         scene: The scene.
