@@ -222,11 +222,11 @@ def _physics(given: Own) -> Physics[float, tuple[float, ...]]:
 
 def _cells(lower: Place, upper: Place, spacing: float, what: str) -> NDArray[np.float64]:
     """Return centers of the cells of a box, as many as fit."""
-    counts = [round((high - low) / spacing) for low, high in zip(lower, upper, strict=False)]
-    if len(lower) != len(upper) or len(lower) not in (2, 3) or min(counts) < 1:
+    cells = [(high - low) / spacing for low, high in zip(lower, upper, strict=False)]
+    if len(lower) != len(upper) or len(lower) not in (2, 3) or min(cells) <= 1 / 2:
         raise SceneError(f"{what}: from {lower} to {upper} there is no room for particles {spacing:g} m apart, in 2D or 3D")
-    _check_number_of(math.prod(counts), what)
-    return lattice(lower, counts, spacing)
+    _check_number_of(math.prod(cells), what)
+    return lattice(lower, [round(each) for each in cells], spacing)
 
 
 def _check_number_of(particles: float, what: str) -> None:

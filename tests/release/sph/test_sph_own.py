@@ -408,6 +408,7 @@ def test_a_mistake_in_what_is_written_is_named(tmp_path, more, message):
         ("density = 1000.0", 'slip = "no"\ndensity = 1.0', "physics.slip: got 'no'; input should be a valid boolean"),
         ("density = 1000.0", 'kernel = "gauss"\ndensity = 1.0', "physics.kernel: got 'gauss'; input should be 'cubic', "),
         ("upper = [0.4, 0.3]", "upper = [0.04, 0.3]", "fill: from .* there is no room for particles 0.1 m apart"),
+        ("upper = [0.4, 0.3]", "upper = [1e300, 1e300]", "fill: asks for inf particles, expected up to 1e.08"),
         ("velocity = [0.5, 0.0]", "velocity = [0.5]", "fill.velocity must have 2 numbers"),
         ('open = ["+y"]', 'open = ["up"]', r"walls\[0\].open\[0\]: input should be '-x', "),
         ("density = 1000.0", "smoothing = 150000\ndensity = 1000.0", "smoothing is 1.5e.05 m, expected 0.1 to 50 particle"),
