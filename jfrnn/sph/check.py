@@ -35,7 +35,6 @@ def check_scene(scene: Scene) -> None:
     _check_particles(scene)
     for name in ("spacing", "duration"):
         _check_number(name, getattr(scene, name))
-    _check_steps(scene)
     for name, place in (("tank", scene.tank), ("bounds", scene.bounds), ("sealed", scene.sealed), ("outflow", scene.outflow)):
         if place is not None:
             _check_corners(name, place.lower, place.upper, scene.dim)
@@ -50,6 +49,7 @@ def check_scene(scene: Scene) -> None:
     if scene.solid is not None:
         _check_solid(scene.solid, scene.dim)
     check_physics(scene.physics)
+    _check_steps(scene)
     if isinstance(scene, FluidScene):
         _check_fluid(scene)
 
@@ -125,13 +125,31 @@ def _check_number(name: str, value: Any, least: float = 0.0) -> float:  # noqa: 
 
 def _check_steps(scene: Scene) -> None:
     """Refuse steps that come to no end."""
-    if scene.step is None:
-        return
-    _check_number("step", scene.step)
-    if scene.step < scene.duration / MOST_STEPS:
+    if scene.step is not None:
+        _check_number("step", scene.step)
+    if (most := longest_step(scene)) < scene.duration / MOST_STEPS:
+        whose = "" if scene.step is not None else ", as smoothing, sound_speed, viscosity and cfl allow"
         raise SceneError(
-            f"step: takes steps of {scene.step:.3g} s for {scene.duration:.3g} s, expected up to {MOST_STEPS:.0e} steps"
+            f"step: takes steps of {most:.3g} s for {scene.duration:.3g} s, expected up to {MOST_STEPS:.0e} steps{whose}"
         )
+
+
+def longest_step(scene: Scene) -> float:
+    """Return a time [s] that no step is longer than: the scene's own, or what sound and viscosity allow; infinite if not known.
+
+    It is not known of a gas, nor of numbers that are traced.
+    """
+    physics = scene.physics
+    if scene.step is not None or isinstance(physics, fluids.Gas):
+        return np.inf if scene.step is None else float(scene.step)
+    viscosity = 0.0 if physics.viscosity is None else physics.viscosity
+    numbers = (physics.smoothing, physics.sound_speed, physics.cfl, physics.density, viscosity)
+    if any(isinstance(number, Tracer) for number in numbers):
+        return np.inf
+    h, c, cfl, density, viscosity = (np.float64(number) for number in numbers)
+    with np.errstate(all="ignore"):
+        kinematic = viscosity / density if physics.viscosity_form == "source" else viscosity
+        return float(cfl * min(h / c, 0.5 * h**2 / kinematic if kinematic else np.inf))
 
 
 def _check_vector(name: str, value: object, dim: int) -> np.ndarray:

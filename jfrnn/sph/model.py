@@ -11,11 +11,12 @@ from jax import Array
 import jfrnn
 from jfrnn.cases.fluids import FluidScene, GasScene, Scene
 from jfrnn.sph import fluid, gas
-from jfrnn.sph.check import check_scene
+from jfrnn.sph.check import check_scene, longest_step
 from jfrnn.sph.errors import SceneError
 from jfrnn.sph.pairs import Neighbors
 from jfrnn.sph.particles import Beside, Flow, Force, GasModel, Model, State
 
+_FINEST = 0.01  # spacings, to which positions must be known: those that are not fall onto each other
 __all__ = ["Kind", "Model", "State", "kind_of", "make_model", "make_state"]
 
 
@@ -95,7 +96,7 @@ def make_model(scene: Scene, dtype: type | None = None, backend: str = "auto", *
 
 
 def _check_range(scene: Scene, dtype: type) -> None:
-    """Refuse lengths and masses of which sums over pairs take powers and products that the dtype has not."""
+    """Refuse what the dtype cannot tell: powers and products in sums over pairs, places of neighbors, times of two steps."""
     spacing, least, largest = np.array([scene.spacing, np.min(scene.masses), np.max(scene.masses)], float)
     tiny, most = float(np.finfo(dtype).smallest_normal), float(np.finfo(dtype).max)
     with np.errstate(all="ignore"):
@@ -104,6 +105,20 @@ def _check_range(scene: Scene, dtype: type) -> None:
         raise SceneError(
             f"spacing {spacing:g} m and masses from {least:g} to {largest:g} kg are beyond {np.dtype(dtype)} in sums over pairs: "
             f"take {'' if dtype == np.float64 else 'float64, or '}units in which they are nearer to 1."
+        )
+    wider, far = "" if dtype == np.float64 else ", or take float64", dtype(np.abs(scene.positions).max())
+    if not (apart := float(np.spacing(far))) <= _FINEST * scene.spacing:
+        raise SceneError(
+            f"positions reach {far:g} m, where {np.dtype(dtype)} knows them to {apart:.3g} m, expected to {_FINEST:g} of a spacing "
+            f"of {scene.spacing:g} m: move the scene to the origin{wider}."
+        )
+    with np.errstate(all="ignore"):
+        end = dtype(scene.duration)
+        ticks = float(np.spacing(end))
+    if not (end > 0 and longest_step(scene) >= ticks):
+        raise SceneError(
+            f"duration is {scene.duration:g} s, whose end {np.dtype(dtype)} knows to {ticks:.3g} s, while no step is longer than "
+            f"{longest_step(scene):.3g} s: take a shorter duration, or longer steps{wider}."
         )
 
 

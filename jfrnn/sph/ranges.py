@@ -15,7 +15,7 @@ _ABOVE_0: Bounds = {"gt": 0}
 _FROM_0: Bounds = {"ge": 0}
 _POSITIVE = (
     *("duration", "step", "reynolds", "radius", "side", "width", "height", "depth", "diameter", "plate", "module", "speed"),
-    *("top_speed", "density", "sound_speed", "smoothing", "exponent", "energy"),
+    *("top_speed", "density", "sound_speed", "smoothing", "energy"),
 )
 _NOT_NEGATIVE = (
     *("viscosity", "artificial", "density_diffusion", "pressure_diffusion", "transport", "shifting", "tension"),
@@ -26,6 +26,7 @@ RANGES: dict[str, Bounds] = {
     **{key: _FROM_0 for key in _NOT_NEGATIVE},
     **{key: {"ge": 1, "le": 10_000} for key in ("nx", "layers")},
     "ny": {"ge": 2, "le": 10_000},
+    "exponent": {"ge": 1, "le": 1000},
     "heat_ratio": {"gt": 1, "lt": 2},
     "smoothing_ratio": {"ge": 1, "le": 4},
     "hot": {"ge": 1, "le": 100},

@@ -40,6 +40,12 @@ def turning(center=(0.0, 0.0), rate=1.0):
         ({"spacing": np.inf}, "spacing must be a finite number above 0, got inf"),
         ({"step": -1.0}, "step must be a finite number above 0, got -1.0"),
         ({"step": 1e-12}, "step: takes steps of 1e-12 s for 1 s, expected up to"),
+        (
+            {"duration": 1e20},
+            r"step: takes steps of 0\.00375 s for 1e\+20 s, expected up to 1e\+09 steps, as smoothing, sound_speed",
+        ),
+        ({"physics": replace(PHYSICS, viscosity=1e20)}, "step: takes steps of 2.81e-23 s for 1 s, expected up to 1e.09 steps, as"),
+        ({"physics": replace(PHYSICS, exponent=1e-20)}, r"physics.exponent: got 1e-20; .*\(from 1 to 1 000\)"),
         ({"tank": fluids.Tank((0.0,) * 3, (1.0,) * 3)}, r"tank.lower must have a number for each of 2 axes, got tuple \(0"),
         ({"tank": fluids.Tank((0.0, 0.0), (0.6, 1.0))}, r"tank must hold all particles, but particle 0 is at \[0.636\d*, 0.269"),
         ({"outflow": ((0.0, 0.0), (1.0, 1.0))}, r"outflow must be a Tank or None, got tuple \(\(0.0, 0.0\), \(1.0, 1.0\)\)"),
@@ -128,7 +134,24 @@ def test_particles_that_float32_has_left_on_a_wall_are_taken():
 @pytest.mark.parametrize(("length", "mass"), [(1e-9, 1e-15), (1e10, 1e15), (1e-6, 1e-30), (1e6, 1e30)])
 def test_numbers_beyond_a_dtype_are_refused(length, mass):
     """In float32 kernels of such lengths lose digits or are 0, and with them forces, without a word."""
-    scene = scene_of(length * POSITIONS, 0.1 * length, replace(PHYSICS, smoothing=0.15 * length), masses=np.full(5, mass))
+    scene = scene_of(
+        length * POSITIONS, 0.1 * length, replace(PHYSICS, smoothing=0.15 * length), masses=np.full(5, mass), duration=length
+    )
     assert make_model(scene, np.float64).m[0] == mass
     message = "spacing .* m and masses from .* kg are beyond float32 in sums over pairs: take float64, or units"
     refuses(SceneError, message, make_model, scene, np.float32)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"positions": POSITIONS + 1e5}, r"positions reach 100001 m, where float32 knows them to 0\.00781 m, expected to"),
+        ({"duration": 1e6}, r"duration is 1e\+06 s, whose end float32 knows to 0\.0625 s, while no step is longer than 0\.00375"),
+        ({"duration": 1e-50}, "duration is 1e-50 s, whose end float32 knows to"),
+    ],
+)
+def test_what_float32_cannot_tell_from_what_is_next_to_it_is_refused(change, message):
+    """Particles would fall onto each other, and a run would never come to its end."""
+    scene = replace(SCENE, **change)
+    assert make_model(scene, np.float64).m[0] == scene.masses[0]
+    refuses(SceneError, message + ".*, or take float64", make_model, scene, np.float32)

@@ -75,7 +75,7 @@ def test_every_number_that_can_be_set_has_a_range_and_defaults_are_within():
         ("taylor-green", "nx=-2", "--set nx: got '-2'; input should be greater than or equal to 1 (from 1 to 10 000)"),
         ("taylor-green", "dim=4", "--set dim: got '4'; input should be less than or equal to 3 (from 2 to 3)"),
         ("dam", "smoothing=0", "--set smoothing: got '0'; input should be greater than 0 (above 0)"),
-        ("dam", "exponent=0", "--set exponent: got '0'; input should be greater than 0 (above 0)"),
+        ("dam", "exponent=0", "--set exponent: got '0'; input should be greater than or equal to 1 (from 1 to 1 000)"),
         ("dam", "duration=NaN", "--set duration: got 'NaN'; input should be a finite number (above 0)"),
         ("dam", "duration=0", "--set duration: got '0'; input should be greater than 0 (above 0)"),
         ("dam", "duration=1e999", "--set duration: got '1e999'; input should be a finite number (above 0)"),
