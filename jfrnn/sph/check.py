@@ -139,9 +139,9 @@ def longest_step(scene: Scene) -> float:
 
     It is not known of a gas, nor of numbers that are traced.
     """
-    physics = scene.physics
-    if scene.step is not None or isinstance(physics, fluids.Gas):
+    if scene.step is not None or not isinstance(scene, FluidScene):
         return np.inf if scene.step is None else float(scene.step)
+    physics = scene.physics
     viscosity = 0.0 if physics.viscosity is None else physics.viscosity
     numbers = (physics.smoothing, physics.sound_speed, physics.cfl, physics.density, viscosity)
     if any(isinstance(number, Tracer) for number in numbers):
