@@ -11,7 +11,7 @@ from jax.core import Tracer
 
 from jfrnn.cases import fluids
 from jfrnn.cases.fluids import FluidScene, GasScene, Scene
-from jfrnn.sph import ranges
+from jfrnn.sph import ranges, viscosity
 from jfrnn.sph.errors import SceneError
 from jfrnn.sph.kernels import KERNELS
 
@@ -142,14 +142,13 @@ def longest_step(scene: Scene) -> float:
     if scene.step is not None or not isinstance(scene, FluidScene):
         return np.inf if scene.step is None else float(scene.step)
     physics = scene.physics
-    viscosity = 0.0 if physics.viscosity is None else physics.viscosity
-    numbers = (physics.smoothing, physics.sound_speed, physics.cfl, physics.density, viscosity)
+    nu = 0.0 if physics.viscosity is None else physics.viscosity
+    numbers = (physics.smoothing, physics.sound_speed, physics.cfl, physics.density, nu)
     if any(isinstance(number, Tracer) for number in numbers):
         return np.inf
-    h, c, cfl, density, viscosity = (np.float64(number) for number in numbers)
+    h, c, cfl, density, nu = (np.float64(number) for number in numbers)
     with np.errstate(all="ignore"):
-        kinematic = viscosity / density if physics.viscosity_form == "source" else viscosity
-        return float(cfl * min(h / c, 0.5 * h**2 / kinematic if kinematic else np.inf))
+        return float(cfl / 0.25 * min(0.25 * h / c, viscosity.longest_step(physics.viscosity_form, nu, density, h)))
 
 
 def _check_vector(name: str, value: object, dim: int) -> np.ndarray:

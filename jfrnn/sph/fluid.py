@@ -156,10 +156,9 @@ def courant(model: Model, s: State) -> Array:
     """
     physics, h = model.physics, model.physics.smoothing
     speed = _greatest(s.v) if s.solid is None else _greatest(s.v) + solids.rim_speed(model, s.solid)
-    limits = [0.25 * h / (physics.sound_speed + speed)]
+    limits: list[Array | float] = [0.25 * h / (physics.sound_speed + speed)]
     if physics.viscosity is not None:
-        kinematic = viscosity.kinematic(physics.viscosity_form, physics.viscosity, physics.density)
-        limits.append((0.0625 if physics.viscosity_form == "fourth" else 0.125) * h**2 / kinematic)
+        limits.append(viscosity.longest_step(physics.viscosity_form, physics.viscosity, physics.density, h))
     limits.append(0.25 * jnp.sqrt(h / jnp.maximum(_greatest(s.a), jnp.finfo(s.x.dtype).smallest_normal ** (1 / 3))))
     return physics.cfl / 0.25 * jnp.min(jnp.stack(limits))
 

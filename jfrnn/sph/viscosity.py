@@ -84,9 +84,18 @@ def artificial(pair: Pair, i: Values, j: Values, strength: Array) -> Array:
     return 2 * strength * pair.h * j["m"] * approach / ((pair.square + 0.01 * pair.h**2) * (i["rho"] + j["rho"]))
 
 
-def kinematic(form: str, viscosity: Array, rho: Array) -> Array:
+def kinematic(form: str, viscosity: Array | float, rho: Array | float) -> Array | float:
     """Return ν [m²/s]: of "source", whose viscosity is the dynamic one, μ/ρ."""
     return viscosity / rho if form == "source" else viscosity
+
+
+def longest_step(form: str, viscosity: Array | float, rho: Array | float, h: float) -> Array | float:
+    """Return the time step [s] that viscosity allows with a Courant number of 0.25, 0.125 h²/ν; of "fourth", half of that.
+
+    The fastest mode of "fourth" on a lattice decays 2.3 times as fast. Source: Morris, Fox & Zhu (1997),
+    doi:10.1006/jcph.1997.5776.
+    """
+    return (0.0625 if form == "fourth" else 0.125) * h**2 / kinematic(form, viscosity, rho)
 
 
 VISCOSITIES = {"morris": morris, "volume": volume, "fourth": fourth, "source": source}
