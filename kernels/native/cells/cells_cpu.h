@@ -295,8 +295,11 @@ struct Sort : SortArguments, Places {
     }
 
     // Notes the lowest bit and the largest exponent of the coordinates of [from, to), as they were given. Whatever lies on no lattice
-    // shows soon: then no more are looked at, by any thread.
+    // shows soon: then no more are looked at, by any thread; nor are any where there is more than one cutoff, or lattice.
+    static constexpr bool MAY_HAVE_UNIT = !DIFFER && !BOXES;
     JFRNN_APART void note_bits(const real* points, int from, int to) {
+        if constexpr (!MAY_HAVE_UNIT)
+            return;
         int lowest = __atomic_load_n(&shared.low_bit, __ATOMIC_RELAXED), highest = 0;
         const int too_low = Bits::exponent(radius) - Bits::BIAS - UNITS;
         for (int i = from; i < to && lowest >= too_low; ++i) {
@@ -316,7 +319,7 @@ struct Sort : SortArguments, Places {
         int there = __atomic_load_n(&least, __ATOMIC_RELAXED);
         while (value < there && !__atomic_compare_exchange_n(&least, &there, value, true, __ATOMIC_RELAXED, __ATOMIC_RELAXED)) {}
     }
-    void find_unit() { shared.unit = BOXES ? real(0) : lattice_unit(shared.low_bit, -shared.minus_high); }
+    void find_unit() { shared.unit = MAY_HAVE_UNIT ? lattice_unit(shared.low_bit, -shared.minus_high) : real(0); }
 
     // The cell of a point, -1 if it is not finite.
     int key_of(const Grid& grid, const real* row) {

@@ -12,8 +12,6 @@
 #pragma once
 #include "exact.h"
 
-constexpr int ONE_CUTOFF = -1, GATHER = 0, SCATTER = 1, EITHER = 2, BOTH = 3, MEAN = 4, TABLE = 5;  // RULE
-constexpr bool DIFFER = RULE != ONE_CUTOFF;                                                         // cutoffs
 constexpr real EPS = DOUBLE ? real(2.220446049250313e-16) : real(1.1920929e-07f);
 constexpr real LEAST = DOUBLE ? real(0x1p-459) : real(0x1p-40f);  // below, squares might underflow
 

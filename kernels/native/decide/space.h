@@ -3,6 +3,9 @@
 #include "float_control.h"
 #include "lattice.h"
 
+constexpr int ONE_CUTOFF = -1, GATHER = 0, SCATTER = 1, EITHER = 2, BOTH = 3, MEAN = 4, TABLE = 5;  // RULE
+constexpr bool DIFFER = RULE != ONE_CUTOFF;                                                         // cutoffs
+
 JFRNN_FUNCTION bool finite_point(const real* p) {
     bool finite = true;
     for (int k = 0; k < DIM; ++k)

@@ -48,7 +48,6 @@ struct CutoffSort : TreeSortArguments {
     }
     // Goes on with a tree where cells are worse, which is known once they are sorted.
     void choose() {
-        cells.shared.unit = 0;  // that one cutoff is a multiple of it tells nothing
         if constexpr (BOXES)
             return;
         if (in_cells() && !cells.one_cell && !are_alike(cells.shared.cells_for))
